@@ -1,0 +1,155 @@
+"""RMP-VICES: the impedance target fused with avoidance over the whole arm."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from rmp_mjx.control.action import ActionRange, compose_setpoint
+from rmp_mjx.control.avoidance import obstacle_branch, self_branch
+from rmp_mjx.control.torque import scale_torque
+from rmp_mjx.control.tree import rmp_vices_tree
+from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
+from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
+from rmp_mjx.rmp.leaves.collision import collision_near
+from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
+from rmp_mjx.rmp.leaves.posture import Posture
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_pose, site_state
+from rmp_mjx.robot.model import Robot
+from rmp_mjx.types import Action, ControlOutput, Setpoint
+
+
+@struct.dataclass
+class RMPVICES:
+    r"""Variable-impedance control as the attractor of an RMP-tree (paper, section III).
+
+    One call evaluates the tree at (q, qd), resolves its root in the inertia metric and
+    turns the acceleration into torque:
+
+    .. math::
+        (M + \epsilon M_q)\, \ddot q = f, \qquad \tau = b + k\, M_q \ddot q .
+
+    The inertia-weighted regulariser makes the tree without its safety leaves converge
+    to (coupled) operational-space control as :math:`\epsilon \to 0`; the paper's
+    Moore-Penrose inverse does not. The controller is a pytree: gains and leaf
+    parameters are array leaves that can be traced, vmapped, differentiated and tuned.
+
+    Leave a branch out of the tree with `None`; leave it at `...` for the default.
+    """
+
+    robot: Robot
+    """The arm."""
+    collision: ScalarLeaf | None | Any = ...
+    """Leaf between every control point and obstacle; its parameters may be arrays that
+    broadcast against (obstacles, points)."""
+    self_collision: ScalarLeaf | None | Any = ...
+    """Leaf between the link capsules that can touch."""
+    joint_limit: ScalarLeaf | None | Any = ...
+    """Leaf on the joints."""
+    posture: Posture | None | Any = ...
+    """Rest configuration, in the inertia metric: fills the null space."""
+    attractor_weight: Float[Array, ""] | float = 1.0
+    """Metric of the two impedance attractors."""
+    regularizer: Float[Array, ""] | float = 1e-3
+    """The root's epsilon: damps accelerations that nothing asks for."""
+    action_range: ActionRange = struct.field(default_factory=ActionRange)
+    """Physical meaning of a policy action in [-1, 1]^12."""
+    jacobian: str = struct.field(pytree_node=False, default="closed_form")
+    """`closed_form` (fast) or `autodiff` (the generic tree, its definition)."""
+
+    def __post_init__(self):
+        """Fill the defaults in and check the one static choice."""
+        if self.jacobian not in ("closed_form", "autodiff"):
+            raise ValueError(
+                f"jacobian must be 'closed_form' or 'autodiff', not {self.jacobian!r}"
+            )
+        robot = self.robot
+        defaults = {
+            "collision": collision_near,
+            "self_collision": collision_near,
+            "joint_limit": lambda: JointLimitBarrier(robot.q_lower, robot.q_upper),
+            "posture": lambda: Posture(q_0=robot.q_home),
+        }
+        for name, make in defaults.items():
+            if getattr(self, name) is ...:
+                object.__setattr__(self, name, make())
+
+    def decode(self, action: Float[Array, " 12"]) -> Action:
+        """Physical units of a policy action in [-1, 1]^12."""
+        return self.action_range.decode(action)
+
+    def setpoint(self, q: Float[Array, " n"], action: Action) -> Setpoint:
+        """Impedance target: the current site pose displaced by the action."""
+        return compose_setpoint(*site_pose(self.robot, q), action)
+
+    def __call__(
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+    ) -> ControlOutput:
+        """Torque for one state.
+
+        Args:
+            q: Joint positions, (n,) [rad].
+            qd: Joint velocities, (n,) [rad/s].
+            setpoint: Impedance target, from `setpoint`.
+            obstacles: Padded obstacle slots.
+
+        Returns:
+            Torque, acceleration, root RMP and diagnostics: `torque_scale` in [0, 1] and
+            `clearance` [m], the least distance of a control point to an obstacle.
+        """
+        arm = arm_state(self.robot, q, qd)
+        Mq, bias = dynamics(self.robot, arm)
+        avoidance, clearance = self._avoidance(arm, obstacles)
+        if self.jacobian == "autodiff":
+            tree = rmp_vices_tree(self, setpoint, obstacles, Mq)
+            root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
+        else:
+            root = self._impedance(site_state(self.robot, arm), setpoint) + avoidance
+            if self.joint_limit is not None:
+                root = root + self.joint_limit(q, qd)
+            if self.posture is not None:
+                root = root + self.posture(q, qd, Mq)
+        qdd = resolve(root, self.regularizer * Mq)
+        dynamic = jnp.matmul(Mq, qdd, precision="highest")
+        tau, scale = scale_torque(dynamic, bias, self.robot.tau_max)
+        return ControlOutput(
+            tau=tau,
+            qdd=qdd,
+            f=root.f,
+            M=root.M,
+            diagnostics={"torque_scale": scale, "clearance": clearance},
+        )
+
+    def _impedance(self, site: SiteState, setpoint: Setpoint) -> RMP:
+        """The two attractors of the end effector, pulled back to the joints."""
+        weight = self.attractor_weight
+        position = PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight)
+        orientation = orientation_attractor(
+            site.R, site.w, setpoint.R_des, setpoint.kp_ori, weight=weight
+        )
+        return pullback(
+            position(site.p, site.v), site.J_pos, site.Jdot_qd_pos
+        ) + pullback(orientation, site.J_ori, site.Jdot_qd_ori)
+
+    def _avoidance(
+        self, arm: ArmState, obstacles: Obstacles
+    ) -> tuple[RMP, Float[Array, ""]]:
+        """The collision branches on the joints, and the clearance."""
+        root = RMP.zero(self.robot.n, arm.p.dtype)
+        clearance = jnp.array(jnp.inf, arm.p.dtype)
+        if self.collision is not None:
+            root, clearance = obstacle_branch(
+                self.robot, arm, obstacles, self.collision
+            )
+        if self.self_collision is not None:
+            root = root + self_branch(self.robot, arm, self.self_collision)
+        return root, clearance

@@ -1,0 +1,211 @@
+"""The RMP-tree of RMP-VICES in its generic form: the definition of the controller.
+
+Every Jacobian and curvature here comes from autodiff of the task maps. The fast
+evaluation in `rmp_vices` is held to this tree by the tests.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rmp_mjx.math import exp_so3, safe_norm
+from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.rmp import RMP, Leaf, Node, ScalarLeaf, Siblings, TaskMap, identity_map
+from rmp_mjx.rmp.leaves.attractor import OrientationAttractor, PositionAttractor
+from rmp_mjx.rmp.leaves.posture import Posture
+from rmp_mjx.robot.kinematics import base_point, forward_kinematics, site_pose
+from rmp_mjx.robot.model import Robot
+from rmp_mjx.types import Setpoint
+
+if TYPE_CHECKING:
+    from rmp_mjx.control.rmp_vices import RMPVICES
+
+
+def rmp_vices_tree(
+    ctrl: RMPVICES, setpoint: Setpoint, obstacles: Obstacles, Mq: Float[Array, "n n"]
+) -> Node:
+    """The controller's tree with the joints at its root (the paper's figure 2).
+
+    Args:
+        ctrl: Supplies the robot and the leaves.
+        setpoint: Impedance target.
+        obstacles: Obstacle slots.
+        Mq: Inertia, the metric of the posture leaf.
+    """
+    robot, weight = ctrl.robot, ctrl.attractor_weight
+    children: list[Node | Siblings | Leaf] = [
+        Node(
+            TaskMap(lambda q: site_pose(robot, q)[0]),
+            (PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight),),
+        ),
+        Node(
+            TaskMap(lambda q: site_pose(robot, q)[1]),
+            (OrientationAttractor(setpoint.R_des, setpoint.kp_ori, weight=weight),),
+        ),
+    ]
+    if ctrl.joint_limit is not None:
+        children.append(ctrl.joint_limit)
+    if ctrl.posture is not None:
+        children.append(InertialPosture(ctrl.posture, Mq))
+    if ctrl.collision is not None and obstacles.kinds and robot.points.segment:
+        children.append(_point_nodes(robot, obstacles, ctrl.collision))
+    if ctrl.self_collision is not None and robot.capsules.pairs:
+        children.append(_self_node(robot, ctrl.self_collision))
+    return Node(identity_map(), tuple(children))
+
+
+@flax.struct.dataclass
+class InertialPosture(Leaf):
+    """The posture leaf with the inertia as its metric."""
+
+    posture: Posture
+    """The leaf."""
+    Mq: Float[Array, "n n"]
+    """Inertia at the current configuration [kg m^2]."""
+
+    def __call__(self, x: Float[Array, " n"], xd: Float[Array, " n"]) -> RMP:
+        """RMP at q, qd."""
+        return self.posture(x, xd, self.Mq)
+
+
+@flax.struct.dataclass
+class Masked(Leaf):
+    """A leaf that counts only where its obstacle slot is in use."""
+
+    leaf: ScalarLeaf
+    """The leaf."""
+    active: Float[Array, " 1"]
+    """1 for a slot in use, else 0."""
+
+    def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
+        """RMP at a distance and its rate."""
+        rmp = self.leaf(x, xd)
+        return RMP(f=rmp.f * self.active, M=rmp.M * self.active)
+
+
+def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: ScalarLeaf) -> Siblings:
+    """Control points as siblings, each with one sibling per obstacle slot."""
+    points = robot.points
+    one_hot = np.arange(robot.n)[None] == np.array(points.segment)[:, None]
+
+    def position(params, q):
+        offset, link = params
+        p, R = forward_kinematics(robot, q)
+        return base_point(robot) + link @ (p + R @ offset)
+
+    def node(offset, link, radius):
+        siblings = []
+        for kind, distance in (
+            (obstacles.spheres, _sphere),
+            (obstacles.planes, _plane),
+            (obstacles.capsules, _capsule),
+            (obstacles.boxes, _box),
+        ):
+            slots = kind.active.shape[0]
+            if not slots:
+                continue
+            params, rates = _moving(kind)
+            params["rho"] = jnp.full(slots, radius)
+            rates["rho"] = jnp.zeros(slots)
+            active = jnp.asarray(kind.active, jnp.result_type(float))[:, None]
+            child = Node(TaskMap(distance, params, rates), (Masked(leaf, active),))
+            siblings.append(Siblings(child))
+        return Node(TaskMap(position, (offset, link)), tuple(siblings))
+
+    nodes = [
+        node(jnp.asarray(o), jnp.asarray(h, o.dtype), r)
+        for o, h, r in zip(
+            np.asarray(points.offset), one_hot, np.asarray(points.radius), strict=True
+        )
+    ]
+    return Siblings.stack(nodes)
+
+
+def _moving(kind: Any) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Parameters of an obstacle's distance map and their rates."""
+    fields = {f: getattr(kind, f) for f in kind.__dataclass_fields__ if f != "active"}
+    velocity = fields.pop("velocity")
+    spin = fields.pop("angular_velocity", None)
+    rates = jax.tree.map(jnp.zeros_like, fields)
+    rates["point" if "point" in fields else "center"] = velocity
+    if spin is not None:
+        fields["turn"], rates["turn"] = jnp.zeros_like(spin), spin
+    return fields, rates
+
+
+def _sphere(o: dict[str, Array], x: Array) -> Array:
+    return safe_norm(x - o["center"]) - o["radius"] - o["rho"]
+
+
+def _plane(o: dict[str, Array], x: Array) -> Array:
+    return jnp.dot(x - o["point"], o["normal"]) - o["rho"]
+
+
+def _capsule(o: dict[str, Array], x: Array) -> Array:
+    r = exp_so3(o["turn"]).T @ (x - o["center"])
+    along = jnp.clip(jnp.dot(r, o["axis"]), -o["half_length"], o["half_length"])
+    return safe_norm(r - along * o["axis"]) - o["radius"] - o["rho"]
+
+
+def _box(o: dict[str, Array], x: Array) -> Array:
+    r = o["rotation"].T @ exp_so3(o["turn"]).T @ (x - o["center"])
+    over = jnp.abs(r) - o["half_size"]
+    outside = safe_norm(jnp.maximum(over, 0.0))
+    return outside + jnp.minimum(jnp.max(over), 0.0) - o["radius"] - o["rho"]
+
+
+def _self_node(robot: Robot, leaf: ScalarLeaf) -> Node:
+    """All capsule pairs as one node: the distances of the pairs that can touch."""
+    capsules = robot.capsules
+    ids = np.array(capsules.pairs).T
+    radii = np.asarray(capsules.radius)[ids].sum(0)
+
+    def distances(q):
+        p, R = forward_kinematics(robot, q)
+        p, R = jnp.concatenate([-base_point(robot)[None], p]), jnp.concatenate(
+            [jnp.eye(3)[None], R]
+        )
+        frame = np.array(capsules.segment) + 1
+        ends = [
+            p[frame] + jnp.einsum("cij,cj->ci", R[frame], jnp.asarray(end))
+            for end in (capsules.start, capsules.end)
+        ]
+        pair = jax.vmap(_segment_distance)
+        (a0, a1), (b0, b1) = (([e[i] for e in ends]) for i in ids)
+        return pair(a0, a1, b0, b1) - radii
+
+    return Node(TaskMap(distances), (leaf,))
+
+
+def _segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
+    """Distance of two segments: the least over the interior and the four ends."""
+    da, db, r = a1 - a0, b1 - b0, a0 - b0
+    aa, bb, ab = da @ da, db @ db, da @ db
+    det = aa * bb - ab * ab
+    skewed = det > 1e-6 * aa * bb + 1e-9
+    safe = jnp.where(skewed, det, 1.0)
+    s = (ab * (db @ r) - (da @ r) * bb) / safe
+    t = (aa * (db @ r) - (da @ r) * ab) / safe
+    crossing = skewed & (s > 0) & (s < 1) & (t > 0) & (t < 1)
+    inner = safe_norm(r + jnp.where(crossing, s, 0.0) * da - jnp.where(crossing, t, 0.0) * db)
+    ends = jnp.stack(
+        [
+            _point_segment(a0, b0, db),
+            _point_segment(a1, b0, db),
+            _point_segment(b0, a0, da),
+            _point_segment(b1, a0, da),
+        ]
+    )
+    return jnp.where(crossing, inner, jnp.min(ends))
+
+
+def _point_segment(x: Array, start: Array, along: Array) -> Array:
+    length2 = along @ along
+    t = jnp.clip((x - start) @ along / jnp.where(length2 > 1e-9, length2, 1.0), 0.0, 1.0)
+    return safe_norm(x - start - t * along)

@@ -1,0 +1,93 @@
+"""VICES: the baseline operational-space impedance controller."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from rmp_mjx.control.action import ActionRange, compose_setpoint
+from rmp_mjx.control.torque import clip_torque
+from rmp_mjx.math import critical_damping, orientation_error, psd_solve
+from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state, site_pose, site_state
+from rmp_mjx.robot.model import Robot
+from rmp_mjx.types import Action, ControlOutput, Setpoint
+
+
+@struct.dataclass
+class VICES:
+    r"""Decoupled operational-space impedance control (paper, eq. 2).
+
+    .. math::
+        \tau = J_p^T \Lambda_p (k_p (p_{des} - p) - k_d v)
+             + J_o^T \Lambda_o (k_p\, e_r(R, R_{des}) - k_d \omega)
+             + N^T M_q \ddot q_0 + b
+
+    with critical damping, :math:`\Lambda = (J M_q^{-1} J^T)^{-1}` of each block by
+    itself, a posture acceleration :math:`\ddot q_0` in the dynamically consistent
+    null space (gains 10 and 2 sqrt(10), as in VICES' code), and torques clipped joint
+    by joint. It takes obstacles and ignores them.
+    """
+
+    robot: Robot
+    """The arm."""
+    kq: Float[Array, ""] | float = 10.0
+    """Posture stiffness in the null space [1/s^2]."""
+    action_range: ActionRange = struct.field(default_factory=ActionRange)
+    """Physical meaning of a policy action in [-1, 1]^12."""
+
+    def decode(self, action: Float[Array, " 12"]) -> Action:
+        """Physical units of a policy action in [-1, 1]^12."""
+        return self.action_range.decode(action)
+
+    def setpoint(self, q: Float[Array, " n"], action: Action) -> Setpoint:
+        """Impedance target: the current site pose displaced by the action."""
+        return compose_setpoint(*site_pose(self.robot, q), action)
+
+    def __call__(
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+    ) -> ControlOutput:
+        """Torque for one state; same signature as `RMPVICES`.
+
+        Returns:
+            Torque, the acceleration it gives, that acceleration as an RMP in the
+            inertia metric, and diagnostics: `torque_scale` in [0, 1].
+        """
+        del obstacles
+        arm = arm_state(self.robot, q, qd)
+        Mq, bias = dynamics(self.robot, arm)
+        site = site_state(self.robot, arm)
+        kd_pos, kd_ori = (
+            critical_damping(k) for k in (setpoint.kp_pos, setpoint.kp_ori)
+        )
+        a_pos = setpoint.kp_pos * (setpoint.p_des - site.p) - kd_pos * site.v
+        error = orientation_error(site.R, setpoint.R_des)
+        a_ori = setpoint.kp_ori * error - kd_ori * site.w
+
+        J = jnp.concatenate([site.J_pos, site.J_ori])
+        MinvJT = psd_solve(Mq, J.T)
+        G = _dot(J, MinvJT)  # inverse of the operational inertia
+        wrench = jnp.concatenate(
+            [psd_solve(G[:3, :3], a_pos), psd_solve(G[3:, 3:], a_ori)]
+        )
+        qdd_0 = self.kq * (self.robot.q_home - q) - critical_damping(self.kq) * qd
+        null = _dot(Mq, qdd_0) - _dot(J.T, psd_solve(G, _dot(J, qdd_0)))
+        dynamic = _dot(J.T, wrench) + null
+        tau, scale = clip_torque(dynamic + bias, jnp.asarray(self.robot.tau_max))
+        return ControlOutput(
+            tau=tau,
+            qdd=psd_solve(Mq, dynamic),
+            f=dynamic,
+            M=Mq,
+            diagnostics={"torque_scale": scale},
+        )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.matmul(a, b, precision="highest")

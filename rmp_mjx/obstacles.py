@@ -1,0 +1,367 @@
+r"""Obstacles as padded slots of fixed shape, and their distance to control points.
+
+Every curved obstacle is a core (point, segment, box) inflated by a radius. With
+:math:`g` the vector from the nearest core point and :math:`\dot g` its rate,
+
+.. math::
+    d = |g| - r, \quad \hat n = g / |g|, \quad \dot d = \hat n \cdot \dot g, \quad
+    \ddot d = \hat n \cdot \ddot x + c, \quad
+    c = \hat n \cdot b + (|\dot g|^2 - \dot d^2) / |g|
+
+where :math:`\ddot x` is the control point's acceleration and b the Coriolis and
+centripetal terms of a rotating obstacle. The gradient is a unit normal everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jaxtyping import Bool, Float
+
+from rmp_mjx.vec import Vec
+
+_TINY = 1e-9
+"""Core distances below this [m] count as the core itself: the normal is arbitrary."""
+
+
+class Gap(NamedTuple):
+    """Distance of every control point to every obstacle of one kind, (o, p) each."""
+
+    distance: Array
+    """Signed distance between surfaces [m]."""
+    rate: Array
+    """Its rate of change, both motions included [m/s]."""
+    normal: Vec
+    """Unit gradient of the distance with respect to the control point."""
+    curvature: Array
+    """The part of the distance's acceleration that is not normal . xdd [m/s^2]."""
+    active: Array
+    """Whether the slot is in use, (o, 1)."""
+
+
+@struct.dataclass
+class Spheres:
+    """Balls."""
+
+    center: Float[Array, "o 3"]
+    """Centre, world frame [m]."""
+    radius: Float[Array, " o"]
+    """Radius [m]."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the centre [m/s]."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
+        """Distances to control points x (p,) with velocities v and radii rho."""
+        g = x - Vec.column(self.center)
+        gdot = v - Vec.column(self.velocity)
+        return _inflate(g, gdot, self.radius[:, None] + rho, self.active)
+
+
+@struct.dataclass
+class Planes:
+    """Half-spaces."""
+
+    point: Float[Array, "o 3"]
+    """A point on the surface, world frame [m]."""
+    normal: Float[Array, "o 3"]
+    """Unit normal that points out of the obstacle."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the surface [m/s]."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
+        """Distances to control points x (p,) with velocities v and radii rho."""
+        n = Vec.column(self.normal)
+        distance = n @ (x - Vec.column(self.point)) - rho
+        rate = n @ (v - Vec.column(self.velocity))
+        return Gap(distance, rate, n, jnp.zeros_like(rate), self.active[:, None])
+
+
+@struct.dataclass
+class Capsules:
+    """Segments inflated by a radius."""
+
+    center: Float[Array, "o 3"]
+    """Middle of the segment, world frame [m]."""
+    axis: Float[Array, "o 3"]
+    """Unit vector along the segment."""
+    half_length: Float[Array, " o"]
+    """Half the segment's length [m]."""
+    radius: Float[Array, " o"]
+    """Radius [m]."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the centre [m/s]."""
+    angular_velocity: Float[Array, "o 3"]
+    """Angular velocity, world frame [rad/s]."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
+        """Distances to control points x (p,) with velocities v and radii rho."""
+        axis, half = Vec.column(self.axis), self.half_length[:, None]
+        r, rel, coriolis = _ride_along(self, x, v)
+        along = axis @ r
+        free = jnp.abs(along) >= half
+        g = r - axis * jnp.clip(along, -half, half)
+        gdot = rel - axis * jnp.where(free, 0.0, axis @ rel)
+        radius = self.radius[:, None] + rho
+        return _inflate(g, gdot, radius, self.active, coriolis)
+
+
+@struct.dataclass
+class Boxes:
+    """Boxes with rounded edges: a box core inflated by a radius."""
+
+    center: Float[Array, "o 3"]
+    """Centre, world frame [m]."""
+    rotation: Float[Array, "o 3 3"]
+    """Orientation (columns are the box's axes)."""
+    half_size: Float[Array, "o 3"]
+    """Half sizes of the core [m]; the radius comes on top."""
+    radius: Float[Array, " o"]
+    """Rounding radius [m]."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the centre [m/s]."""
+    angular_velocity: Float[Array, "o 3"]
+    """Angular velocity, world frame [rad/s]."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
+        """Distances to control points x (p,) with velocities v and radii rho.
+
+        Inside the core the distance is minus the depth below the nearest face.
+        """
+        axes = [Vec.column(self.rotation[:, :, i]) for i in range(3)]
+        half = Vec.column(self.half_size)
+        r, rel, coriolis = _ride_along(self, x, v)
+        local, local_v = (Vec(*(a @ w for a in axes)) for w in (r, rel))
+        over = local.map(lambda c, h: jnp.abs(c) - h, half)
+        depth = jnp.maximum(jnp.maximum(over.x, over.y), over.z)
+        inside = depth <= 0.0
+        # Outside, g is what exceeds the core; inside, the normal of the nearest face.
+        x_face = over.x >= depth
+        y_face = (over.y >= depth) & ~x_face
+        face = Vec(x_face, y_face, ~(x_face | y_face))
+        free = face.map(lambda f, o: jnp.where(inside, f, o > 0.0), over)
+        reach = over.map(lambda o: jnp.where(inside, 1.0, o))
+        sign = local.map(lambda c: jnp.where(c < 0.0, -1.0, 1.0))
+        local_g = free.map(lambda f, s, o: jnp.where(f, s * o, 0.0), sign, reach)
+        local_gdot = free.map(lambda f, c: jnp.where(f, c, 0.0), local_v)
+        g, gdot = (
+            axes[0] * w.x + axes[1] * w.y + axes[2] * w.z for w in (local_g, local_gdot)
+        )
+        radius = self.radius[:, None] + rho
+        gap = _inflate(g, gdot, radius, self.active, coriolis)
+        return gap._replace(distance=jnp.where(inside, depth - radius, gap.distance))
+
+
+def _inflate(
+    g: Vec, gdot: Vec, radius: Array, active: Array, coriolis: Vec | None = None
+) -> Gap:
+    """Gap to a core inflated by a radius, from the vector off the core and its rate."""
+    squared = g @ g
+    touching = squared <= _TINY**2
+    norm = jnp.sqrt(jnp.where(touching, 1.0, squared))
+    inverse = 1.0 / norm
+    up = jnp.where(touching, 1.0, 0.0)
+    normal = (g * jnp.where(touching, 0.0, inverse)) + Vec(0.0 * up, 0.0 * up, up)
+    rate = normal @ gdot
+    curvature = jnp.where(touching, 0.0, (gdot @ gdot - rate * rate) * inverse)
+    if coriolis is not None:
+        curvature = curvature + normal @ coriolis
+    distance = jnp.where(touching, 0.0, norm) - radius
+    return Gap(distance, rate, normal, curvature, active[:, None])
+
+
+def _ride_along(body: Capsules | Boxes, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
+    """Position, velocity and Coriolis acceleration seen from a moving obstacle."""
+    omega = Vec.column(body.angular_velocity)
+    r = x - Vec.column(body.center)
+    rdot = v - Vec.column(body.velocity)
+    swept = omega.cross(r)
+    coriolis = omega.cross(swept) - omega.cross(rdot) * 2.0
+    return r, rdot - swept, coriolis
+
+
+@struct.dataclass
+class Obstacles:
+    """All obstacles of a scene. Slots are padded: shapes never change, only contents.
+
+    Build with `empty`, then fill with the `with_...` methods, which return copies and
+    work under jit; they use the first slots and switch the others of that kind off.
+    """
+
+    spheres: Spheres
+    """Balls."""
+    planes: Planes
+    """Half-spaces."""
+    capsules: Capsules
+    """Rounded segments."""
+    boxes: Boxes
+    """Rounded boxes."""
+
+    @staticmethod
+    def empty(
+        spheres: int = 0, planes: int = 0, capsules: int = 0, boxes: int = 0
+    ) -> Obstacles:
+        """Slots for so many obstacles of each kind, none in use."""
+        up = jnp.array([0.0, 0.0, 1.0])
+
+        def common(n: int) -> dict[str, Array]:
+            return {"velocity": jnp.zeros((n, 3)), "active": jnp.zeros(n, bool)}
+
+        def turning(n: int) -> dict[str, Array]:
+            spin = {"angular_velocity": jnp.zeros((n, 3))}
+            return common(n) | spin | {"center": jnp.zeros((n, 3))}
+
+        return Obstacles(
+            spheres=Spheres(
+                center=jnp.zeros((spheres, 3)),
+                radius=jnp.ones(spheres),
+                **common(spheres),
+            ),
+            planes=Planes(
+                point=jnp.zeros((planes, 3)),
+                normal=jnp.tile(up, (planes, 1)),
+                **common(planes),
+            ),
+            capsules=Capsules(
+                axis=jnp.tile(up, (capsules, 1)),
+                half_length=jnp.zeros(capsules),
+                radius=jnp.ones(capsules),
+                **turning(capsules),
+            ),
+            boxes=Boxes(
+                rotation=jnp.tile(jnp.eye(3), (boxes, 1, 1)),
+                half_size=jnp.zeros((boxes, 3)),
+                radius=jnp.ones(boxes),
+                **turning(boxes),
+            ),
+        )
+
+    @property
+    def kinds(self) -> tuple[Spheres | Planes | Capsules | Boxes, ...]:
+        """The kinds that have at least one slot."""
+        every = (self.spheres, self.planes, self.capsules, self.boxes)
+        return tuple(kind for kind in every if kind.active.shape[-1])
+
+    def with_spheres(self, centers, radii, velocities=None) -> Obstacles:
+        """Use the first k sphere slots.
+
+        Args:
+            centers: (k, 3), world frame [m].
+            radii: (k,) or one number [m].
+            velocities: (k, 3) [m/s]; default at rest.
+
+        Raises:
+            ValueError: More than the slots there are, or a radius that is not positive.
+        """
+        _check_positive("sphere radii", radii)
+        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            spheres=_fill(
+                self.spheres, center=centers, radius=radii, velocity=velocities
+            )
+        )
+
+    def with_planes(self, points, normals, velocities=None) -> Obstacles:
+        """Use the first k plane slots: a point (k, 3) on each and its normal (k, 3)."""
+        normals = jnp.asarray(normals, float)
+        unit = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
+        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            planes=_fill(self.planes, point=points, normal=unit, velocity=velocities)
+        )
+
+    def with_capsules(
+        self, starts, ends, radii, velocities=None, angular_velocities=None
+    ) -> Obstacles:
+        """Use the first k capsule slots: segments (k, 3) to (k, 3) [m] and radii."""
+        _check_positive("capsule radii", radii)
+        starts, ends = jnp.asarray(starts, float), jnp.asarray(ends, float)
+        length = jnp.linalg.norm(ends - starts, axis=-1)
+        axis = (ends - starts) / jnp.maximum(length, _TINY)[..., None]
+        up = jnp.array([0.0, 0.0, 1.0])
+        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            capsules=_fill(
+                self.capsules,
+                center=0.5 * (starts + ends),
+                axis=jnp.where(length[..., None] > _TINY, axis, up),
+                half_length=0.5 * length,
+                radius=radii,
+                velocity=velocities,
+                angular_velocity=angular_velocities,
+            )
+        )
+
+    def with_boxes(
+        self,
+        centers,
+        half_sizes,
+        rotations=None,
+        radii=0.0,
+        velocities=None,
+        angular_velocities=None,
+    ) -> Obstacles:
+        """Use the first k box slots.
+
+        Args:
+            centers: (k, 3), world frame [m].
+            half_sizes: (k, 3), of the core [m].
+            rotations: (k, 3, 3), columns are the box's axes; default aligned.
+            radii: Rounding added to the core, (k,) or one number [m].
+            velocities: Of the centres, (k, 3) [m/s]; default at rest.
+            angular_velocities: World frame, (k, 3) [rad/s]; default none.
+
+        Raises:
+            ValueError: More than the slots there are, or a half size not positive.
+        """
+        _check_positive("box half sizes", half_sizes)
+        if rotations is None:
+            rotations = jnp.tile(jnp.eye(3), (np.shape(centers)[0], 1, 1))
+        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            boxes=_fill(
+                self.boxes,
+                center=centers,
+                rotation=rotations,
+                half_size=half_sizes,
+                radius=radii,
+                velocity=velocities,
+                angular_velocity=angular_velocities,
+            )
+        )
+
+
+def _check_positive(what: str, values) -> None:
+    """Refuse concrete values that are not positive and finite; tracers pass."""
+    if isinstance(values, jax.core.Tracer):
+        return
+    array = np.asarray(values, float)
+    if not (np.all(np.isfinite(array)) and np.all(array > 0)):
+        raise ValueError(f"{what} must be positive and finite, got {array.tolist()}")
+
+
+def _fill(slots, **contents):
+    """Write k obstacles into the first k slots and switch the rest off."""
+    total = slots.active.shape[0]
+    first = next(value for value in contents.values() if value is not None)
+    k = np.shape(first)[0]
+    if k > total:
+        kind = type(slots).__name__.lower()
+        raise ValueError(
+            f"{k} {kind} do not fit in {total} slots: "
+            f"start from Obstacles.empty({kind}={k})"
+        )
+    filled = {"active": jnp.arange(total) < k}
+    for name, value in contents.items():
+        old = getattr(slots, name)
+        new = jnp.zeros_like(old[:k]) if value is None else jnp.asarray(value, old.dtype)
+        filled[name] = old.at[:k].set(jnp.broadcast_to(new, old[:k].shape))
+    return slots.replace(**filled)

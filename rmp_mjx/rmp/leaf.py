@@ -1,0 +1,37 @@
+"""Leaf base classes: where a behaviour is defined, in its own coordinate."""
+
+from __future__ import annotations
+
+import abc
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rmp_mjx.rmp.algebra import RMP
+
+
+class Leaf(abc.ABC):
+    """A motion policy on the coordinate ``x`` of its parent node.
+
+    Concrete leaves are `flax.struct.dataclass` pytrees whose parameters are array
+    leaves, so they can be traced, vmapped, differentiated and learned.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
+        """The leaf's RMP at ``x``, ``xd``: f (m,), M (m, m)."""
+
+
+class ScalarLeaf(Leaf):
+    """A leaf that acts on every coordinate separately (diagonal metric)."""
+
+    @abc.abstractmethod
+    def scalar(
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
+        """Elementwise force ``f = m a`` and metric ``m``, each shaped like ``x``."""
+
+    def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
+        """The same policy as an RMP with metric ``diag(m)``."""
+        f, m = self.scalar(x, xd)
+        return RMP(f=f, M=jnp.diag(m))

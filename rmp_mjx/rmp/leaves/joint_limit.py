@@ -1,0 +1,163 @@
+"""Joint-limit leaves: a barrier, and the RMPflow and Lula forms for comparison."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rmp_mjx.math import approach_gate, speed_gate
+from rmp_mjx.rmp.leaf import ScalarLeaf
+from rmp_mjx.rmp.leaves.barrier import Barrier
+
+
+def joint_limit_barrier() -> Barrier:
+    """The verified barrier for joint limits; distances in rad (or m)."""
+    return Barrier(mu=1e-2, eps=0.2, eta=20.0, r=1.0, margin=0.12, cap=1e3)
+
+
+@flax.struct.dataclass
+class JointLimitBarrier(ScalarLeaf):
+    """The one-dimensional `Barrier` on both distances, ``q - lower``, ``upper - q``.
+
+    A side at infinity contributes exactly nothing.
+    """
+
+    lower: Float[Array, " n"]
+    """Lower limits, (n,), [rad] or [m]; -inf for none."""
+    upper: Float[Array, " n"]
+    """Upper limits, (n,), [rad] or [m]; +inf for none."""
+    barrier: Barrier = flax.struct.field(default_factory=joint_limit_barrier)
+    """The barrier applied to each side; its fields may be scalars or (n,)."""
+
+    def scalar(
+        self, x: Float[Array, " n"], xd: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Force (n,) and metric (n,) at joint positions and velocities."""
+        f_lower, m_lower = self.barrier.scalar(x - self.lower, xd)
+        f_upper, m_upper = self.barrier.scalar(self.upper - x, -xd)
+        return f_lower - f_upper, m_lower + m_upper
+
+
+def _span(lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+    """Finite lower end and width, and the mask of joints limited on both sides."""
+    limited = jnp.isfinite(lower) & jnp.isfinite(upper)
+    low = jnp.where(limited, lower, 0.0)
+    return low, jnp.where(limited, upper, 1.0) - low, limited
+
+
+@flax.struct.dataclass
+class RMPflowJointLimit(ScalarLeaf):
+    r"""The velocity-gated joint-limit metric of RMPflow, as its authors code it.
+
+    With :math:`s = (q - l)/(u - l)`, :math:`d = 4 s (1 - s)` and gates
+    :math:`\alpha_u = 1 - \exp(-\max(\dot q, 0)^2 / 2\sigma^2)` (:math:`\alpha_l` with
+    min):
+
+    .. math::
+        b &= s (\alpha_u d + 1 - \alpha_u) + (1 - s)(\alpha_l d + 1 - \alpha_l) \\
+        m &= \lambda b^{-2}, \quad f = m (\gamma_p (q_0 - q) - \gamma_d \dot q) - \xi,
+        \quad \xi = \tfrac12 \lambda \, \partial_q b^{-2} \, \dot q^2
+
+    It is a brake that acts on fast joints, not a wall: at rest the metric is
+    ``lambda`` everywhere. Joints without two finite limits contribute nothing.
+
+    Source: Cheng et al., "RMPflow" (2018), appendix on joint limits.
+    """
+
+    lower: Float[Array, " n"]
+    """Lower limits, (n,), [rad]."""
+    upper: Float[Array, " n"]
+    """Upper limits, (n,), [rad]."""
+    q_0: Float[Array, " n"] | None = None
+    """Rest position, (n,), [rad]; the middle of the range if None."""
+    lam: Float[Array, ""] | float = 0.01
+    """Metric scale."""
+    sigma: Float[Array, ""] | float = 0.1
+    """Width of the velocity gate, [rad/s]."""
+    gamma_p: Float[Array, ""] | float = 0.05
+    """Stiffness, [1/s^2]."""
+    gamma_d: Float[Array, ""] | float = 0.1
+    """Damping, [1/s]."""
+    b_min: Float[Array, ""] | float = 1e-2
+    """Clamp of b from below: the metric is at most ``lam / b_min^2``."""
+
+    def scalar(
+        self, x: Float[Array, " n"], xd: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Force (n,) and metric (n,) at joint positions and velocities."""
+        low, width, limited = _span(self.lower, self.upper)
+        alpha_u = speed_gate(jnp.maximum(xd, 0.0), self.sigma)
+        alpha_l = speed_gate(jnp.minimum(xd, 0.0), self.sigma)
+
+        def inverse_b2(q):
+            s = jnp.clip((q - low) / width, 0.0, 1.0)
+            d = 4.0 * s * (1.0 - s)
+            b = s * (alpha_u * d + 1.0 - alpha_u)
+            b = b + (1.0 - s) * (alpha_l * d + 1.0 - alpha_l)
+            return jnp.maximum(b, self.b_min) ** -2
+
+        q = jnp.where(limited, x, low + 0.5 * width)
+        weight, slope = jax.jvp(inverse_b2, (q,), (jnp.ones_like(q),))
+        q_0 = low + 0.5 * width if self.q_0 is None else self.q_0
+        m = self.lam * weight
+        f = m * (self.gamma_p * (q_0 - q) - self.gamma_d * xd)
+        f = f - 0.5 * self.lam * slope * xd * xd
+        return jnp.where(limited, f, 0.0), jnp.where(limited, m, 0.0)
+
+
+@flax.struct.dataclass
+class LulaJointLimit(ScalarLeaf):
+    r"""The joint-limit leaf of NVIDIA's Lula RMPflow, one policy per range end.
+
+    On the distance to a limit normalised by the joint's range, with speed
+    :math:`\dot x`:
+
+    .. math::
+        a = \frac{k_p}{x^2 / l_p^2 + e_p} - k_d \dot x, \qquad
+        m = (1 - \mathrm{sigmoid}(\dot x / v_m)) \frac{\mu}{x / l_m + e_m},
+
+    pulled back to the joint through the (constant) normalisation. Joints without two
+    finite limits contribute nothing. Defaults are those of the Franka configuration.
+    """
+
+    lower: Float[Array, " n"]
+    """Lower limits, (n,), [rad]."""
+    upper: Float[Array, " n"]
+    """Upper limits, (n,), [rad]."""
+    kp: Float[Array, ""] | float = 1.0
+    """Repulsion gain, [1/s^2]."""
+    lp: Float[Array, ""] | float = 0.1
+    """Length scale of the repulsion, [-]."""
+    ep: Float[Array, ""] | float = 0.01
+    """Offset that bounds the repulsion, [-]."""
+    kd: Float[Array, ""] | float = 200.0
+    """Damping, [1/s]."""
+    mu: Float[Array, ""] | float = 1000.0
+    """Metric scale."""
+    lm: Float[Array, ""] | float = 0.01
+    """Length scale of the metric, [-]."""
+    em: Float[Array, ""] | float = 1e-3
+    """Offset that bounds the metric, [-]."""
+    vm: Float[Array, ""] | float = 0.01
+    """Width of the velocity gate, [1/s]."""
+
+    def scalar(
+        self, x: Float[Array, " n"], xd: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Force (n,) and metric (n,) at joint positions and velocities."""
+        low, width, limited = _span(self.lower, self.upper)
+        s = jnp.where(limited, (x - low) / width, 0.5)
+        sd = xd / width
+        f_lower, m_lower = self._side(s, sd)
+        f_upper, m_upper = self._side(1.0 - s, -sd)
+        f = (f_lower - f_upper) / width
+        m = (m_lower + m_upper) / (width * width)
+        return jnp.where(limited, f, 0.0), jnp.where(limited, m, 0.0)
+
+    def _side(self, x: Array, xd: Array) -> tuple[Array, Array]:
+        x = jnp.maximum(x, 0.0)
+        a = self.kp / ((x / self.lp) ** 2 + self.ep) - self.kd * xd
+        m = approach_gate(xd, self.vm) * self.mu / (x / self.lm + self.em)
+        return m * a, m

@@ -1,0 +1,203 @@
+"""Checkpoints: atomic, verified, complete.
+
+A checkpoint is a flat set of arrays written by Orbax (temporary folder, then a
+rename), beside a manifest with every array's path, shape, dtype and SHA-256: Orbax
+itself neither detects a flipped bit nor refuses another dtype. Zero-size arrays,
+which Orbax cannot store, come from the template; PRNG keys are stored as their data.
+"""
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+
+class CheckpointError(RuntimeError):
+    """No usable checkpoint; the message says why."""
+
+
+class CheckpointMismatch(CheckpointError):
+    """The checkpoint belongs to another configuration or task."""
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _storable(leaf: Any) -> np.ndarray:
+    data = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    return np.asarray(jax.device_get(data))
+
+
+def _storable_shape(leaf: Any) -> jax.ShapeDtypeStruct:
+    return jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+
+
+def _describe(path: str, array: np.ndarray) -> dict[str, Any]:
+    return {
+        "path": path,
+        "shape": list(array.shape),
+        "dtype": str(array.dtype),
+        "sha256": hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest(),
+    }
+
+
+def _digest(arrays: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(arrays, sort_keys=True).encode()).hexdigest()
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+
+
+class Checkpointer:
+    """The checkpoints of one run folder."""
+
+    def __init__(self, folder: Path, keep: int = 3, read_only: bool = False):
+        """Open a folder of checkpoints.
+
+        Args:
+            folder: The folder; created unless `read_only`.
+            keep: Newest checkpoints that are kept.
+            read_only: Do not create or clean up anything.
+        """
+        for name in ("absl", "orbax"):  # they narrate every save at INFO and WARNING
+            logging.getLogger(name).setLevel(logging.ERROR)
+        self._folder = folder.absolute()
+        self._read_only = read_only
+        if read_only and not self._folder.is_dir():
+            raise CheckpointError(f"no checkpoints in {folder}")
+        self._manager = ocp.CheckpointManager(
+            self._folder,
+            options=ocp.CheckpointManagerOptions(
+                max_to_keep=None if read_only else keep,
+                enable_async_checkpointing=False,
+                cleanup_tmp_directories=not read_only,
+                create=not read_only,
+                read_only=read_only,
+            ),
+        )
+
+    def save(self, step: int, state: Any) -> None:
+        """Write a checkpoint; when this returns it is complete.
+
+        Args:
+            step: Its number, larger than all before.
+            state: Any pytree of arrays.
+        """
+        arrays, manifest = {}, {}
+        for index, (path, leaf) in enumerate(_named_leaves(state).items()):
+            array = _storable(leaf)
+            if array.size:
+                name = f"{index:05d}"
+                arrays[name] = array
+                manifest[name] = _describe(path, array)
+        self._manager.save(
+            step,
+            args=ocp.args.Composite(
+                state=ocp.args.StandardSave(arrays),  # pyright: ignore
+                manifest=ocp.args.JsonSave(  # pyright: ignore
+                    {"arrays": manifest, "sha256": _digest(manifest)}
+                ),
+            ),
+        )
+        self._manager.wait_until_finished()
+
+    def restore(
+        self, template: Any, note: Callable[[str], None]
+    ) -> tuple[int, Any]:
+        """Read the newest sound checkpoint.
+
+        Args:
+            template: Pytree of arrays or shapes that the result will look like; parts
+                that are None are not read.
+            note: Called with one line for each checkpoint that had to be skipped.
+
+        Returns:
+            Step number and the state.
+
+        Raises:
+            CheckpointMismatch: Arrays are missing or have other shapes or dtypes.
+            CheckpointError: There is no sound checkpoint.
+        """
+        steps = sorted(self._manager.all_steps(read=True), reverse=True)
+        damaged = []
+        for step in steps:
+            try:
+                stored = self._read(step)
+            except Exception as error:  # Orbax's errors share no base class
+                reason = " ".join(str(error).split())[:200]
+                note(f"checkpoint {step} is damaged, trying an older one: {reason}")
+                damaged.append(step)
+            else:
+                state = _fill(template, stored)
+                for old in () if self._read_only else damaged:
+                    self._manager.delete(old)  # its number will be needed again
+                return step, state
+        raise CheckpointError(f"no usable checkpoint in {self._folder}")
+
+    def _read(self, step: int) -> dict[str, np.ndarray]:
+        """Arrays by path, every one verified."""
+        manifest = self._manager.restore(
+            step,
+            args=ocp.args.Composite(manifest=ocp.args.JsonRestore()),  # pyright: ignore
+        )["manifest"]
+        if _digest(manifest["arrays"]) != manifest["sha256"]:
+            raise CheckpointError("the manifest fails its checksum")
+        manifest = manifest["arrays"]
+        shapes = {
+            name: np.zeros(entry["shape"], entry["dtype"])
+            for name, entry in manifest.items()
+        }
+        arrays = self._manager.restore(
+            step,
+            args=ocp.args.Composite(
+                state=ocp.args.StandardRestore(shapes)  # pyright: ignore
+            ),
+        )["state"]
+        stored = {}
+        for name, entry in manifest.items():
+            array = np.asarray(arrays[name])
+            if _describe(entry["path"], array) != entry:
+                raise CheckpointError(f"{entry['path']} fails its checksum")
+            stored[entry["path"]] = array
+        return stored
+
+    def close(self) -> None:
+        """Release Orbax's threads."""
+        self._manager.close()
+
+
+def _fill(template: Any, stored: dict[str, np.ndarray]) -> Any:
+    """Put stored arrays into the template's structure."""
+    wrong, leaves = [], []
+    for path, leaf in _named_leaves(template).items():
+        shape = _storable_shape(leaf)
+        array = stored.get(path)
+        if not np.prod(shape.shape):
+            array = np.zeros(shape.shape, shape.dtype)
+        if array is None:
+            wrong.append(f"{path}: missing")
+            continue
+        if array.shape != shape.shape or array.dtype != shape.dtype:
+            wrong.append(
+                f"{path}: {array.dtype}{list(array.shape)} saved, "
+                f"{shape.dtype}{list(shape.shape)} wanted"
+            )
+            continue
+        value = jnp.array(array)
+        if _is_key(leaf):
+            value = jax.random.wrap_key_data(value)
+        leaves.append(value)
+    if wrong:
+        shown = "; ".join(wrong[:5]) + (" ..." if len(wrong) > 5 else "")
+        raise CheckpointMismatch(f"checkpoint of another configuration: {shown}")
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)

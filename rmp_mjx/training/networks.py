@@ -1,0 +1,89 @@
+"""Policy and value networks, assembled from Brax's parts."""
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo import networks as ppo_networks
+from flax import linen
+from jaxtyping import Array, Float, PRNGKeyArray
+
+Agent = Callable[[Float[Array, "b n"], PRNGKeyArray], Float[Array, "b m"]]
+"""Observations and a key to actions in [-1, 1], both batched."""
+
+OBS_LIMIT = 10.0
+"""Normalised observations are clipped to this many standard deviations."""
+
+
+def make_networks(
+    observation_size: int,
+    action_size: int,
+    hidden_sizes: tuple[int, ...],
+    init_log_std: float,
+) -> ppo_networks.PPONetworks:
+    """Build the networks: a Gaussian policy with its own deviation, and a value.
+
+    The policy's last layer starts at a tenth of the usual size, so that the first
+    actions are centred; its deviation does not depend on the observation.
+
+    Args:
+        observation_size: Length of an observation.
+        action_size: Length of an action.
+        hidden_sizes: Widths of the hidden layers, tanh in between.
+        init_log_std: Initial log standard deviation.
+
+    Returns:
+        Brax's bundle of policy network, value network and action distribution.
+    """
+
+    def preprocess(obs, statistics):
+        return running_statistics.normalize(obs, statistics, max_abs_value=OBS_LIMIT)
+
+    return ppo_networks.make_ppo_networks(
+        observation_size,
+        action_size,
+        preprocess_observations_fn=preprocess,
+        policy_hidden_layer_sizes=hidden_sizes,
+        value_hidden_layer_sizes=hidden_sizes,
+        activation=linen.tanh,
+        distribution_type="normal",
+        noise_std_type="log",
+        init_noise_std=math.exp(init_log_std),
+        mean_kernel_init_fn=jax.nn.initializers.variance_scaling,
+        mean_kernel_init_kwargs={
+            "scale": 0.01,
+            "mode": "fan_in",
+            "distribution": "uniform",
+        },
+    )
+
+
+def make_agent(
+    networks: ppo_networks.PPONetworks, normalizer, policy_params, deterministic: bool
+) -> Agent:
+    """Bind parameters to a function from observations to clipped actions."""
+    distribution = networks.parametric_action_distribution
+
+    def act(obs, key):
+        logits = networks.policy_network.apply(normalizer, policy_params, obs)
+        if deterministic:
+            action = distribution.mode(logits)
+        else:
+            action = distribution.sample(logits, key)
+        return jnp.clip(action, -1.0, 1.0)
+
+    return act
+
+
+def zero_agent(action_size: int) -> Agent:
+    """An agent that always commands the middle of the action range."""
+    return lambda obs, key: jnp.zeros((obs.shape[0], action_size))
+
+
+def random_agent(action_size: int) -> Agent:
+    """An agent that draws uniform actions, independently at each step."""
+    return lambda obs, key: jax.random.uniform(
+        key, (obs.shape[0], action_size), minval=-1.0, maxval=1.0
+    )

@@ -1,0 +1,144 @@
+"""The folder of a run: what it contains, and who may write into it."""
+
+import fcntl
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import IO
+
+import jax
+
+from rmp_mjx.training.config import (
+    ConfigError,
+    TrainConfig,
+    differing_fields,
+    load_config,
+    save_config,
+)
+
+CONFIG = "config.json"
+VERSIONS = "versions.json"
+METRICS = "metrics.parquet"
+CHECKPOINTS = "checkpoints"
+TENSORBOARD = "tensorboard"
+CURVE = "learning_curve.png"
+VIDEO = "video.mp4"
+EVALUATION = "eval.json"
+LOCK = "lock"
+RESULTS = (CONFIG, VERSIONS, METRICS, CHECKPOINTS, TENSORBOARD, CURVE, VIDEO, EVALUATION)
+
+
+def default_run_dir(config: TrainConfig) -> Path:
+    """A new folder name under runs/, from the task, the controller and the time."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{config.env}-{config.controller}-seed{config.seed}-{stamp}"
+    return Path("runs") / name
+
+
+def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
+    """Prepare and lock the folder of a run; starts no JAX backend.
+
+    Args:
+        config: Validated configuration.
+
+    Returns:
+        The folder, and its lock: the lock lasts as long as the file stays open.
+
+    Raises:
+        ConfigError: The folder has results already, belongs to another
+            configuration, cannot be written, or another process uses it.
+    """
+    if config.resume:
+        folder = Path(config.resume)
+        different = differing_fields(load_config(folder / CONFIG), config)
+        if different:
+            changes = ", ".join(f"{k}: {a} -> {b}" for k, (a, b) in different.items())
+            raise ConfigError(f"a resumed run keeps its configuration ({changes})")
+    else:
+        folder = Path(config.run_dir) if config.run_dir else default_run_dir(config)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = _lock(folder)
+    except OSError as error:
+        raise ConfigError(f"cannot write to {folder}: {error.strerror}") from error
+    if not config.resume:
+        others = sorted(p.name for p in folder.iterdir() if p.name != LOCK)
+        if others and not config.overwrite:
+            raise ConfigError(
+                f"{folder} is not empty: --resume {folder} continues that run, "
+                "--overwrite deletes its results"
+            )
+        for name in RESULTS:
+            path = folder / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return folder, lock
+
+
+def _lock(folder: Path) -> IO[str]:
+    """Take the folder's lock; the system releases it when the process ends."""
+    lock = (folder / LOCK).open("a+")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        lock.seek(0)
+        owner = lock.read().strip() or "another process"
+        lock.close()
+        raise ConfigError(f"{folder} is in use by {owner}") from error
+    lock.truncate(0)
+    lock.write(f"process {os.getpid()} on {platform.node()}\n")
+    lock.flush()
+    return lock
+
+
+def describe(folder: Path, config: TrainConfig) -> None:
+    """Write the configuration and the versions that a run used.
+
+    A resumed run keeps what it was started with; its own versions are added.
+    """
+    save_config(config, folder / CONFIG)
+    path = folder / VERSIONS
+    history = json.loads(path.read_text()) if path.exists() else []
+    path.write_text(json.dumps([*history, versions()], indent=2) + "\n")
+
+
+def versions() -> dict[str, str]:
+    """What this process runs on: packages, code, device, command line."""
+    packages = "jax jaxlib brax flax optax mujoco mujoco-mjx numpy rmp-mjx".split()
+    found = {}
+    for name in packages:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed as a package"
+    device = jax.devices()[0]
+    return {
+        "python": platform.python_version(),
+        **found,
+        "git": _git_revision(),
+        "device": f"{jax.device_count()} x {device.device_kind} ({device.platform})",
+        "machine": f"{platform.platform()}, {os.cpu_count()} CPUs",
+        "command": " ".join(sys.argv),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+
+
+def _git_revision() -> str:
+    """Revision of the working directory, with a mark for uncommitted changes."""
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=False,
+            cwd=Path(__file__).parent,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
+    return done.stdout.strip() or "unknown"

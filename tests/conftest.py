@@ -1,0 +1,47 @@
+"""Set-up shared by every test: XLA flags and one compile cache per test run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# `envs` and the scripts live beside the package, not inside it.
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
+
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Prepare JAX before any test module can start its backend.
+
+    Workers and the commands that tests start inherit the cache folder, so each
+    program is compiled once a run. Set JAX_COMPILATION_CACHE_DIR to keep it.
+    """
+    if _CACHE not in os.environ:
+        os.environ[_CACHE] = tempfile.mkdtemp(prefix="rmp-mjx-test-xla-")
+        config.stash[_own_cache] = Path(os.environ[_CACHE])
+
+    from rmp_mjx import runtime
+
+    runtime.configure(cache_dir=os.environ[_CACHE])
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if _own_cache in config.stash:
+        shutil.rmtree(config.stash[_own_cache], ignore_errors=True)
+
+
+_own_cache = pytest.StashKey[Path]()
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The checkout."""
+    return ROOT

@@ -1,0 +1,142 @@
+"""The import law of CONTRIBUTING.md, and imports without side effects."""
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Room -> the rooms that it may import (besides itself). Single modules at the top of
+# the package are rooms of their own; `rmp_mjx` is the public facade.
+BASE = {"types", "math", "vec"}
+LAW = {
+    "types": {"math", "rmp"},
+    "math": set(),
+    "vec": {"math"},
+    "runtime": set(),
+    "rmp": {"math", "vec"},
+    "obstacles": BASE | {"rmp"},
+    "robot": BASE | {"rmp", "obstacles"},
+    "control": BASE | {"rmp", "obstacles", "robot"},
+    "sim": BASE | {"obstacles", "robot"},
+    "training": {"types", "math", "runtime"},
+    "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
+}
+TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}
+KNOW_MUJOCO = {"robot", "sim"}
+
+
+def modules(package: str) -> list[Path]:
+    return sorted(p for p in (ROOT / package).rglob("*.py"))
+
+
+def dotted(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room(module: str) -> str:
+    """`rmp_mjx.rmp.algebra` -> `rmp`; `rmp_mjx` -> `rmp_mjx`; `envs.x` -> `envs`."""
+    head, *rest = module.split(".")
+    return rest[0] if head == "rmp_mjx" and rest else head
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Dotted names of everything a file imports, at any depth of nesting."""
+    here = dotted(path)
+    package = here if path.name == "__init__.py" else here.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parent = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*parent, *([base] if base else [])])
+            # `from rmp_mjx import math` names a room; `from x import Y` does not.
+            for alias in node.names:
+                yield f"{base}.{alias.name}" if base == "rmp_mjx" else base
+
+
+def at_import(tree: ast.AST) -> Iterator[ast.AST]:
+    """Nodes that run when a module is imported (function bodies do not)."""
+    for child in ast.iter_child_nodes(tree):
+        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            for decorator in getattr(child, "decorator_list", []):
+                yield decorator
+                yield from at_import(decorator)
+            continue
+        if isinstance(child, ast.If) and "__main__" in ast.dump(child.test):
+            continue
+        yield child
+        yield from at_import(child)
+
+
+@pytest.mark.parametrize("path", modules("rmp_mjx"), ids=dotted)
+def test_a_room_imports_only_the_rooms_below_it(path):
+    here = room(dotted(path))
+    assert here in LAW, f"new room {here!r}: give it a place in the import law"
+    for name in imports(path):
+        head = name.split(".")[0]
+        assert head not in TOP_LEVEL, f"{dotted(path)} imports {name}"
+        if head == "mujoco":
+            assert here in KNOW_MUJOCO, f"{dotted(path)} imports {name}"
+        if head == "rmp_mjx" and here != room(name) and room(name) in LAW:
+            assert room(name) in LAW[here], f"{dotted(path)} imports {name}"
+
+
+@pytest.mark.parametrize("path", modules("envs"), ids=dotted)
+def test_environments_know_nothing_of_training(path):
+    for name in imports(path):
+        assert room(name) != "training", f"{dotted(path)} imports {name}"
+        assert name.split(".")[0] not in TOP_LEVEL - {"envs"}
+
+
+@pytest.mark.parametrize("path", modules("rmp_mjx") + modules("envs"), ids=dotted)
+def test_importing_a_module_does_nothing_but_define(path):
+    for node in at_import(ast.parse(path.read_text())):
+        if isinstance(node, ast.Attribute):
+            text = ast.unparse(node)
+            assert not text.startswith("os.environ"), f"{text} at import"
+            assert not text.startswith("jax.config"), f"{text} at import"
+        if isinstance(node, ast.Call):
+            text = ast.unparse(node.func)
+            assert text != "print", f"{dotted(path)} prints at import"
+            assert not text.startswith(("jnp.", "jax.numpy.", "jax.random.")), (
+                f"{dotted(path)} line {node.lineno}: {text}() makes an array at import"
+            )
+
+
+def test_importing_everything_starts_no_backend_and_sets_nothing():
+    code = """
+import os, pkgutil, importlib
+import jax, mujoco, flax, optax, polars, brax.training.acme.running_statistics
+import orbax.checkpoint, matplotlib, mediapy, tensorboardX, rich, tyro
+from mujoco import mjx
+before, settings = dict(os.environ), dict(jax.config.values)
+import rmp_mjx, envs
+for package in (rmp_mjx, envs):
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(found.name)
+assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
+changed = {k for k, v in jax.config.values.items() if settings.get(k, v) != v}
+assert not changed, changed
+from jax._src import xla_bridge
+assert not xla_bridge.backends_are_initialized(), "a backend was started"
+print("quiet")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().splitlines()[-1] == "quiet"

@@ -1,0 +1,82 @@
+import re
+import tomllib
+import zipfile
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+MAX_LINES = 400  # the project's hard stop for one file
+
+
+@pytest.fixture(scope="module")
+def wheel(root, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    (path,) = WheelBuilder(str(root)).build(
+        directory=str(folder), versions=["standard"]
+    )
+    return set(zipfile.ZipFile(path).namelist())
+
+
+@pytest.fixture(scope="module")
+def project(root):
+    return tomllib.loads((root / "pyproject.toml").read_text())["project"]
+
+
+@pytest.fixture(scope="module")
+def locked(root):
+    lines = (root / "requirements.lock").read_text().splitlines()
+    return dict(line.split("==") for line in lines)
+
+
+def test_the_wheels_only_top_level_name_is_rmp_mjx(wheel):
+    top = {name.split("/")[0] for name in wheel}
+    assert {name for name in top if not name.endswith(".dist-info")} == {"rmp_mjx"}
+
+
+def test_the_wheel_carries_every_module_and_robot_description(wheel, root):
+    files = [p for p in (root / "rmp_mjx").rglob("*") if p.suffix in {".py", ".xml"}]
+    wanted = {p.relative_to(root).as_posix() for p in files}
+    assert any(name.endswith(".xml") for name in wanted)
+    assert wanted <= wheel
+
+
+def test_the_wheel_carries_the_licence(wheel):
+    assert any(name.endswith("licenses/LICENSE") for name in wheel)
+
+
+def test_the_lock_is_plain_pins_without_the_project_itself(root):
+    pin = re.compile(r"^[A-Za-z0-9._-]+==[A-Za-z0-9.!+]+$")
+    lines = (root / "requirements.lock").read_text().splitlines()
+    assert all(pin.match(line) for line in lines)
+    assert not any(line.lower().startswith("rmp") for line in lines)
+
+
+def test_the_lock_meets_every_requirement_that_the_project_states(project, locked):
+    pins = {canonicalize_name(name): version for name, version in locked.items()}
+    stated = project["dependencies"] + project["optional-dependencies"]["dev"]
+    stated += project["optional-dependencies"]["peers"]
+    for requirement in map(Requirement, stated):
+        if requirement.name == project["name"]:
+            continue
+        version = pins[canonicalize_name(requirement.name)]
+        assert version in requirement.specifier, f"{requirement} but {version} locked"
+
+
+def test_the_version_is_said_once(project):
+    import rmp_mjx
+
+    assert rmp_mjx.__version__ == project["version"]
+
+
+def test_no_source_file_is_too_long_to_read(root):
+    folders = ("rmp_mjx", "envs", "tests", "benchmarks")
+    files = [p for folder in folders for p in (root / folder).rglob("*.py")]
+    files += list(root.glob("*.py"))
+    long = {
+        p.relative_to(root).as_posix(): n
+        for p in files
+        if (n := len(p.read_text().splitlines())) > MAX_LINES
+    }
+    assert not long

@@ -1,0 +1,95 @@
+"""The documents' Python blocks run and their commands exist."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "benchmarks" / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.S | re.M)
+
+
+def commands() -> list[tuple[str, str]]:
+    """Every shell line of the documents, comments stripped: (document, command)."""
+    found = []
+    for document in DOCUMENTS:
+        for block in blocks(document, "bash"):
+            for line in block.replace("\\\n", " ").splitlines():
+                command = line.split("#")[0].strip()
+                if command:
+                    found.append((document.name, command))
+    return found
+
+
+@cache
+def help_text(*target: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *target, "--help"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    "document", [d for d in DOCUMENTS if blocks(d, "python")], ids=lambda d: d.stem
+)
+def test_the_python_blocks_of_a_document_run_in_order(document):
+    namespace: dict[str, object] = {}
+    for block in blocks(document, "python"):
+        exec(compile(block, document.name, "exec"), namespace)
+
+
+def test_the_readmes_controller_example_gives_bounded_torques():
+    import jax.numpy as jnp
+
+    namespace: dict[str, object] = {}
+    for block in blocks(ROOT / "README.md", "python"):
+        exec(compile(block, "README.md", "exec"), namespace)
+    tau = namespace["tau"]
+    assert tau.shape == (256, 7)
+    assert bool(jnp.isfinite(tau).all())
+
+
+@pytest.mark.parametrize(
+    ("document", "command"), commands(), ids=lambda v: v.replace(" ", "_")[:50]
+)
+def test_the_commands_of_the_documents_exist(document, command):
+    words = command.split()
+    while words and re.match(r"^[A-Z_]+=", words[0]):
+        words = words[1:]
+    if words[0] == "make":
+        target = next(w for w in words[1:] if "=" not in w)
+        makefile = (ROOT / "Makefile").read_text()
+        assert re.search(rf"^{re.escape(target)}:", makefile, re.M), target
+    elif words[0] == "python":
+        if words[1] == "-m":
+            assert importlib.util.find_spec(words[2]), f"no module {words[2]}"
+            if not words[2].startswith("benchmarks"):
+                return
+            target, rest = ("-m", words[2]), words[3:]
+        else:
+            assert (ROOT / words[1]).exists(), f"no script {words[1]}"
+            target, rest = (words[1],), words[2:]
+        # Underscores and dashes are both accepted in option names.
+        shown = help_text(*target).replace("_", "-")
+        for flag in (w.split("=")[0] for w in rest if w.startswith("--")):
+            assert re.search(rf"{flag.replace('_', '-')}\b", shown), (
+                f"{document}: {flag}"
+            )
