@@ -7,10 +7,13 @@
 .DELETE_ON_ERROR:
 SHELL := /bin/bash
 
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
-# A version manager may put a shim called python3.12 on the path without a Python
-# 3.12 behind it, so it counts only if it runs.
-PYTHON312 ?= $(shell python3.12 -c 'import sys; print(sys.executable)' 2>/dev/null)
+# A version manager may put a shim called python3.11 on the path without a Python 3.11
+# behind it, so one counts only if it runs and says so.
+find = $(shell for p in python$(1) python3; do $$p -c 'import sys; \
+  v = "%d.%d" % sys.version_info[:2]; sys.exit(v != "$(1)" or print(sys.executable))' \
+  2>/dev/null && break; done)
+PYTHON ?= $(call find,3.11)
+PYTHON312 ?= $(call find,3.12)
 JOBS ?= 2
 ARGS ?=
 
@@ -24,16 +27,15 @@ PIP := -m pip --disable-pip-version-check install --quiet
 .PHONY: help setup train test test-slow test-latest lint format type bench docs clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile
+	@sed -n '1,4s/^#  *//p' Makefile
 
 setup: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
-	@test -n "$(PYTHON)" || { echo "no python3 found: install Python 3.11"; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
-	  echo "the locked set-up is for Python 3.11, found $$($(PYTHON) -V): say"; \
-	  echo "make PYTHON=/path/to/python3.11, or see make test-latest for 3.12"; exit 1; }
-	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	@test -x $(PY) || test -n "$(PYTHON)" || { \
+	  echo "Python 3.11 not found (the locked set-up is for it): install it, or say"; \
+	  echo "make PYTHON=/path/to/python3.11; for 3.12 see make test-latest"; exit 1; }
+	test -x $(PY) || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 	$(PY) $(PIP) -r requirements.lock
 	$(PY) $(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
@@ -65,16 +67,15 @@ bench: $(STAMP)
 
 docs: $(STAMP)
 	$(PY) $(PIP) -c requirements.lock -e '.[docs]'
-	$(PY) -m mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
 # Python 3.12 and the newest release of everything.
 test-latest:
-ifeq ($(PYTHON312),)
-	@echo "test-latest: no Python 3.12 here (name one: make test-latest PYTHON312=...)"
-else
-	@$(MAKE) --no-print-directory $(LATEST_STAMP)
-	$(LATEST)/bin/python -m pytest -n $(JOBS) --dist loadfile $(ARGS)
-endif
+	@test -n "$(PYTHON312)" || \
+	  echo "no Python 3.12 here: name one with make test-latest PYTHON312=..."
+	@test -z "$(PYTHON312)" || $(MAKE) --no-print-directory $(LATEST_STAMP)
+	@test -z "$(PYTHON312)" || \
+	  $(LATEST)/bin/python -m pytest -n $(JOBS) --dist loadfile $(ARGS)
 
 $(LATEST_STAMP): pyproject.toml
 	test -x $(LATEST)/bin/python || $(PYTHON312) -m venv $(LATEST)

@@ -21,6 +21,8 @@ def psd_solve(
     vectorises under `jax.vmap`. The scaling makes the accuracy independent of the
     units of the rows. Pivots are clamped at ``n`` machine epsilons (of the scaled
     matrix, whose diagonal is one): a singular matrix gives a finite answer, not NaN.
+    In float32 the relative error is about 1e-7 times the condition of the scaled
+    matrix, so metrics of one tree should be capped to span less than about 1e6.
 
     Args:
         A: Symmetric PSD matrix, (n, n). Only the lower triangle is read.

@@ -9,26 +9,27 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
 import jax
 
-# jaxlib 0.10's CPU fusion passes recompute a whole kinematic chain at every link:
-# mjx.kinematics of a 7-joint arm goes from about 2 us to milliseconds or more per
-# environment. Older and newer lines do not need these flags, and XLA aborts the
-# process on a flag that it does not know, so they are tied to the exact line.
-_CPU_FLAGS: Mapping[tuple[int, int], tuple[str, ...]] = {
-    (0, 10): (
-        "--xla_cpu_use_fusion_emitters=false",
-        "--xla_cpu_experimental_ynn_fusion_type=",
-    ),
-}
+# From jaxlib 0.10.0 until 0.11.0 XLA's CPU fusion recomputes a whole kinematic chain at
+# every link: mjx.kinematics of a 7-joint arm goes from a few microseconds to several
+# milliseconds or more per environment. Later releases neither need nor know the first
+# flag, and XLA aborts the process on a flag that it does not know, so the flags are tied
+# to exactly the releases they were tried on.
+_CPU_FLAGS = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_experimental_ynn_fusion_type=",
+)
+_CPU_FLAGS_SINCE = (0, 10, 0)
+_CPU_FLAGS_BEFORE = (0, 11, 1)
 
 _GL_CONTEXT_MODULES = (
     "mujoco.rendering.classic.gl_context",
@@ -62,7 +63,7 @@ def configure(
     ``JAX_COMPILATION_CACHE_DIR``, ``MUJOCO_GL``) always win.
 
     Args:
-        cpu_flags: Append the CPU flags that this jaxlib line needs for fast
+        cpu_flags: Append the CPU flags that this jaxlib release needs for fast
             kinematics. They do not affect a GPU.
         compile_cache: Keep compiled programs on disk between runs.
         cache_dir: Folder of that cache. By default
@@ -97,9 +98,9 @@ def configure(
 
 def cpu_xla_flags(jaxlib_version: str | None = None) -> tuple[str, ...]:
     """CPU flags for a jaxlib version, the installed one by default."""
-    version = jaxlib_version or metadata.version("jaxlib")
-    major, minor, *_ = (int(part) for part in version.split(".")[:2])
-    return _CPU_FLAGS.get((major, minor), ())
+    text = jaxlib_version or metadata.version("jaxlib")
+    release = tuple(int(part) for part in re.findall(r"\d+", text)[:3])
+    return _CPU_FLAGS if _CPU_FLAGS_SINCE <= release < _CPU_FLAGS_BEFORE else ()
 
 
 def merge_flags(current: str, extra: tuple[str, ...]) -> str:

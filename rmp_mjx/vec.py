@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -72,3 +73,26 @@ class Vec:
             self.z * other.x - self.x * other.z,
             self.x * other.y - self.y * other.x,
         )
+
+
+def sum_all(terms: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Sum several arrays of one shape over their first axis, in a single pass.
+
+    One variadic reduction computes what the terms share once; separate sums would
+    make XLA's CPU backend compute it for each of them.
+    """
+    zeros = tuple(jnp.zeros((), t.dtype) for t in terms)
+
+    def add(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(x + y for x, y in zip(a, b, strict=True))
+
+    return tuple(jax.lax.reduce(terms, zeros, add, (0,)))
+
+
+def add_once(*terms: Array) -> Array:
+    """Sum arrays of one shape into a value that is stored, not recomputed by its users.
+
+    XLA's CPU backend fuses a plain sum, and all that leads to it, into every element
+    of every consumer; a reduction ends the fusion.
+    """
+    return jnp.sum(jnp.stack(terms), axis=0)

@@ -42,13 +42,13 @@ def test_merging_twice_changes_nothing():
     assert runtime.merge_flags(once, flags) == once
 
 
-@pytest.mark.parametrize("version", ["0.9.2", "0.11.0", "0.12.0.1", "1.0.0"])
-def test_lines_that_may_not_know_the_flags_get_none(version):
+@pytest.mark.parametrize("version", ["0.9.2", "0.11.1", "0.11.2", "0.12.0.1", "1.0.0"])
+def test_releases_that_do_not_know_the_flags_get_none(version):
     assert runtime.cpu_xla_flags(version) == ()
 
 
-@pytest.mark.parametrize("version", ["0.10.0", "0.10.2", "0.10.2.dev1"])
-def test_the_line_that_needs_the_flags_gets_them(version):
+@pytest.mark.parametrize("version", ["0.10.0", "0.10.2", "0.10.2.dev1", "0.11.0"])
+def test_the_releases_that_need_the_flags_get_them(version):
     assert "--xla_cpu_use_fusion_emitters=false" in runtime.cpu_xla_flags(version)
 
 

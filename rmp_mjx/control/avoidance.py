@@ -9,10 +9,16 @@ from jaxtyping import Array, Float
 
 from rmp_mjx.obstacles import Gap, Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf
-from rmp_mjx.robot.kinematics import ArmState, base_point
+from rmp_mjx.robot.kinematics import (
+    ArmState,
+    Motion,
+    base_point,
+    carry_points,
+    select,
+)
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, PointState, point_state, pull_to_joints
-from rmp_mjx.vec import Vec
+from rmp_mjx.vec import Vec, add_once, sum_all
 
 
 def obstacle_branch(
@@ -49,15 +55,14 @@ def _sum_obstacles(gap: Gap, leaf: ScalarLeaf) -> PointRMP:
     m = jnp.where(gap.active, m, 0.0)
     n = gap.normal
     mn = n * m
-    return PointRMP(
-        f=Vec(*(jnp.sum(c * f, axis=0) for c in (n.x, n.y, n.z))),
-        xx=jnp.sum(mn.x * n.x, axis=0),
-        xy=jnp.sum(mn.x * n.y, axis=0),
-        xz=jnp.sum(mn.x * n.z, axis=0),
-        yy=jnp.sum(mn.y * n.y, axis=0),
-        yz=jnp.sum(mn.y * n.z, axis=0),
-        zz=jnp.sum(mn.z * n.z, axis=0),
+    fx, fy, fz, *metric = sum_all(
+        (
+            *(n.x * f, n.y * f, n.z * f),
+            *(mn.x * n.x, mn.x * n.y, mn.x * n.z),
+            *(mn.y * n.y, mn.y * n.z, mn.z * n.z),
+        )
     )
+    return PointRMP(Vec(fx, fy, fz), *metric)
 
 
 def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
@@ -73,73 +78,54 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
     Returns:
         RMP on the joints; f (n,), M (n, n).
     """
-    pairs = robot.capsules.pairs
-    if not pairs:
-        return RMP.zero(robot.n, arm.p.dtype)
-    segment = np.array(robot.capsules.segment)
-    far, near = (np.array(side) for side in zip(*pairs, strict=True))
-    ends = _capsule_ends(robot, arm, np.concatenate([far, near]))
-    V, A = (_relative(x, segment[far], segment[near]) for x in (arm.V, arm.A))
-    radii = np.asarray(robot.capsules.radius)
-    positions, velocities = ends
+    capsules, n = robot.capsules, robot.n
+    if not capsules.pairs:
+        return RMP.zero(n, arm.p.dtype)
+    ids = np.array(capsules.pairs).T
+    segment, radii = np.array(capsules.segment)[ids], np.asarray(capsules.radius)[ids]
+    far, near = (np.arange(n)[:, None] == s for s in segment)
+    V, A = (select(motion, 1.0 * far - near) for motion in (arm.V, arm.A))
 
-    def unit_wrench(x):
-        g, p, norm = _segment_gap(x, len(pairs))
-        n = g * (1.0 / norm)
-        return jnp.concatenate([n.stack(), p.cross(n).stack()]), norm
+    # The four ends of each pair, far then near, and their velocities.
+    ends = [(end, side) for side in (0, 1) for end in (capsules.start, capsules.end)]
+    offset = np.concatenate([np.asarray(end)[ids[side]] for end, side in ends])
+    x, carrier = carry_points(robot, arm, offset, np.repeat(segment, 2, axis=0).ravel())
+    v = select(arm.V, carrier).at(x)
 
-    (w, norm), (wdot, _) = jax.jvp(unit_wrench, (positions,), (velocities,))
-    rate = jnp.sum(w * V, axis=0)
-    curvature = jnp.sum(w * A + wdot * V, axis=0)
-    f, m = leaf.scalar(norm - (radii[far] + radii[near]), rate)
-    f = f - m * curvature
-    joints = np.arange(robot.n)
-    between = (joints > segment[near][:, None]) & (joints <= segment[far][:, None])
-    rows = jnp.matmul(w.T, arm.S, precision="highest") * between
+    def unit_wrench(x: Vec) -> tuple[Motion, Array]:
+        g, p, norm = _segment_gap(x)
+        normal = g * (1.0 / norm)
+        return Motion(normal, p.cross(normal)), norm
+
+    (w, norm), (wdot, _) = jax.jvp(unit_wrench, (x,), (v,))
+    rate = w.lin @ V.lin + w.ang @ V.ang
+    curvature = w.lin @ A.lin + w.ang @ A.ang + wdot.lin @ V.lin + wdot.ang @ V.ang
+    f, m = leaf.scalar(norm - radii.sum(0), rate)
+    joints = np.arange(n)
+    between = (joints > segment[1][:, None]) & (joints <= segment[0][:, None])
+    rows = jnp.sum(w.stack()[:, :, None] * arm.S.stack()[:, None, :], axis=0)
+    rows = jnp.where(between, rows, 0.0)
+    f, m = add_once(f, -m * curvature), add_once(m, jnp.zeros_like(m))
     return RMP(
         f=jnp.sum(rows * f[:, None], axis=0),
-        M=jnp.einsum("pi,p,pj->ij", rows, m, rows, precision="highest"),
+        M=jnp.sum((rows * m[:, None])[:, :, None] * rows[:, None, :], axis=0),
     )
 
 
-def _relative(x: Array, far: np.ndarray, near: np.ndarray) -> Array:
-    """Spatial vectors of the far links minus those of the near ones, (6, pairs)."""
-    select = np.zeros((x.shape[1], len(far)))
-    select[far, np.arange(len(far))] += 1.0
-    on_arm = near >= 0
-    select[near[on_arm], np.flatnonzero(on_arm)] -= 1.0
-    return jnp.matmul(x, jnp.asarray(select, x.dtype), precision="highest")
+def _segment_gap(x: Vec) -> tuple[Vec, Vec, Array]:
+    """Closest points of segment pairs: vector from near to far, a point, distance.
 
-
-def _capsule_ends(robot: Robot, arm: ArmState, ids: np.ndarray) -> tuple[Array, Array]:
-    """Positions and velocities (3, 2, len(ids)) of the ends, about the base point."""
-    capsules, dtype = robot.capsules, arm.p.dtype
-    segment = np.array(capsules.segment)[ids]
-    local = np.stack(
-        [np.asarray(capsules.start)[ids], np.asarray(capsules.end)[ids]], axis=0
-    )
-    fixed = local - np.asarray(robot.offset[0])
-    inner = np.maximum(segment, 0)
-    R, p = arm.R[inner], arm.p[inner]
-    moved = p.T[:, None] + jnp.einsum(
-        "cij,ecj->iec", R, jnp.asarray(local, dtype), precision="highest"
-    )
-    still = jnp.asarray(np.moveaxis(fixed, 2, 0), dtype)
-    x = jnp.where(segment < 0, still, moved)
-    V = jnp.where(segment < 0, 0.0, arm.V[:, inner])
-    w, v0 = V[3:, None], V[:3, None]
-    return x, v0 + jnp.cross(w, x, axis=0)
-
-
-def _segment_gap(x: Array, k: int) -> tuple[Vec, Vec, Array]:
-    """Closest points of k segment pairs: vector from near to far, a point, distance.
+    x holds the starts and ends of the far segments, then those of the near ones.
 
     Ericson, "Real-Time Collision Detection" (2005), section 5.1.9, with the clamps
     written as selections so that values and derivatives are finite for parallel and
     degenerate segments.
     """
-    a, b = Vec.of(x[:, 0, :k], 0), Vec.of(x[:, 0, k:], 0)
-    da, db = Vec.of(x[:, 1, :k], 0) - a, Vec.of(x[:, 1, k:], 0) - b
+    a, a_end, b, b_end = (
+        x.map(lambda c, i=i: c[i * (len(c) // 4) : (i + 1) * (len(c) // 4)])
+        for i in range(4)
+    )
+    da, db = a_end - a, b_end - b
     r = a - b
     aa, bb, ab = da @ da, db @ db, da @ db
     ar, br = da @ r, db @ r

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
@@ -22,6 +23,7 @@ from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_pose, site_state
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
+from rmp_mjx.vec import add_once
 
 
 @struct.dataclass
@@ -108,16 +110,17 @@ class RMPVICES:
         """
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
-        avoidance, clearance = self._avoidance(arm, obstacles)
+        branches, clearance = self._avoidance(arm, obstacles)
         if self.jacobian == "autodiff":
             tree = rmp_vices_tree(self, setpoint, obstacles, Mq)
             root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
         else:
-            root = self._impedance(site_state(self.robot, arm), setpoint) + avoidance
+            branches += self._impedance(site_state(self.robot, arm), setpoint)
             if self.joint_limit is not None:
-                root = root + self.joint_limit(q, qd)
+                branches.append(self.joint_limit(q, qd))
             if self.posture is not None:
-                root = root + self.posture(q, qd, Mq)
+                branches.append(self.posture(q, qd, Mq))
+            root = jax.tree.map(add_once, *branches)
         qdd = resolve(root, self.regularizer * Mq)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
         tau, scale = scale_torque(dynamic, bias, self.robot.tau_max)
@@ -129,27 +132,26 @@ class RMPVICES:
             diagnostics={"torque_scale": scale, "clearance": clearance},
         )
 
-    def _impedance(self, site: SiteState, setpoint: Setpoint) -> RMP:
+    def _impedance(self, site: SiteState, setpoint: Setpoint) -> list[RMP]:
         """The two attractors of the end effector, pulled back to the joints."""
         weight = self.attractor_weight
         position = PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight)
         orientation = orientation_attractor(
             site.R, site.w, setpoint.R_des, setpoint.kp_ori, weight=weight
         )
-        return pullback(
-            position(site.p, site.v), site.J_pos, site.Jdot_qd_pos
-        ) + pullback(orientation, site.J_ori, site.Jdot_qd_ori)
+        return [
+            pullback(position(site.p, site.v), site.J_pos, site.Jdot_qd_pos),
+            pullback(orientation, site.J_ori, site.Jdot_qd_ori),
+        ]
 
     def _avoidance(
         self, arm: ArmState, obstacles: Obstacles
-    ) -> tuple[RMP, Float[Array, ""]]:
+    ) -> tuple[list[RMP], Float[Array, ""]]:
         """The collision branches on the joints, and the clearance."""
-        root = RMP.zero(self.robot.n, arm.p.dtype)
-        clearance = jnp.array(jnp.inf, arm.p.dtype)
+        branches, clearance = [], jnp.array(jnp.inf, arm.p.dtype)
         if self.collision is not None:
-            root, clearance = obstacle_branch(
-                self.robot, arm, obstacles, self.collision
-            )
+            rmp, clearance = obstacle_branch(self.robot, arm, obstacles, self.collision)
+            branches.append(rmp)
         if self.self_collision is not None:
-            root = root + self_branch(self.robot, arm, self.self_collision)
-        return root, clearance
+            branches.append(self_branch(self.robot, arm, self.self_collision))
+        return branches, clearance

@@ -97,7 +97,7 @@ def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: ScalarLeaf) -> Siblin
     def position(params, q):
         offset, link = params
         p, R = forward_kinematics(robot, q)
-        return base_point(robot) + link @ (p + R @ offset)
+        return base_point(robot) + (p + jnp.einsum("ijn,j->in", R, offset)) @ link
 
     def node(offset, link, radius):
         siblings = []
@@ -168,12 +168,11 @@ def _self_node(robot: Robot, leaf: ScalarLeaf) -> Node:
 
     def distances(q):
         p, R = forward_kinematics(robot, q)
-        p, R = jnp.concatenate([-base_point(robot)[None], p]), jnp.concatenate(
-            [jnp.eye(3)[None], R]
-        )
+        p = jnp.concatenate([-base_point(robot)[:, None], p], axis=1)
+        R = jnp.concatenate([jnp.eye(3)[:, :, None], R], axis=2)
         frame = np.array(capsules.segment) + 1
         ends = [
-            p[frame] + jnp.einsum("cij,cj->ci", R[frame], jnp.asarray(end))
+            p[:, frame].T + jnp.einsum("ijc,cj->ci", R[:, :, frame], jnp.asarray(end))
             for end in (capsules.start, capsules.end)
         ]
         pair = jax.vmap(_segment_distance)

@@ -6,8 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rmp_mjx.robot.kinematics import ArmState, joint_forces, joint_metric
+from rmp_mjx.robot.kinematics import (
+    ArmState,
+    Motion,
+    carry_points,
+    joint_forces,
+    joint_metric,
+)
 from rmp_mjx.robot.model import Robot
+from rmp_mjx.vec import Vec, add_once
 
 
 def dynamics(
@@ -24,49 +31,63 @@ def dynamics(
     """
     n = robot.n
     mass = jnp.asarray(robot.mass, arm.p.dtype)
-    c = (arm.p + _mv(arm.R, robot.com)).T
-    inertia = jnp.einsum(
-        "nij,njk,nlk->iln", arm.R, robot.inertia, arm.R, precision="highest"
+    c, _ = carry_points(robot, arm, np.asarray(robot.com), np.arange(n))
+    rows = _world_inertia(robot, arm)
+    w, alpha = arm.V.ang, arm.A.ang
+    gravity = Vec.of(jnp.asarray(robot.gravity, arm.p.dtype))
+    acceleration = arm.A.at(c) + w.cross(arm.V.at(c)) - gravity
+    force = acceleration * mass
+    spin = Vec(*(row @ w for row in rows))
+    torque = Vec(*(row @ alpha for row in rows)) + w.cross(spin) + c.cross(force)
+
+    # Inertia about the base point: Ic + m (c.c 1 - c c^T).
+    moment = c * mass
+    cc = moment @ c
+    xx, yy, zz = (
+        row[i] + cc - m * x
+        for i, (row, m, x) in enumerate(
+            zip(map(_xyz, rows), _xyz(moment), _xyz(c), strict=True)
+        )
     )
-    v0, w = arm.V[:3], arm.V[3:]
-    a0, alpha = arm.A[:3], arm.A[3:]
-    velocity = v0 + jnp.cross(w, c, axis=0)
-    acceleration = a0 + jnp.cross(alpha, c, axis=0) + jnp.cross(w, velocity, axis=0)
-    force = mass * (acceleration - jnp.asarray(robot.gravity)[:, None])
-    torque = _apply(inertia, alpha) + jnp.cross(w, _apply(inertia, w), axis=0)
-    wrench = jnp.concatenate([force, jnp.cross(c, force, axis=0) + torque])
-
-    outer = np.tril(np.ones((n, n)))  # sums over links k, k + 1, ...
-    C = _skew(c)
-    mC = mass * C
-    mCC = jnp.einsum("ijn,jkn->ikn", mC, C, precision="highest")
-    eye = jnp.eye(3)[:, :, None] * mass
-    spatial = jnp.concatenate(
-        [
-            jnp.concatenate([eye, -mC], axis=1),
-            jnp.concatenate([mC, inertia - mCC], axis=1),
-        ]
+    xy = rows[0].y - moment.x * c.y
+    xz = rows[0].z - moment.x * c.z
+    yz = rows[1].z - moment.y * c.z
+    own = [mass, *_xyz(moment), xx, xy, xz, yy, yz, zz, *_xyz(force), *_xyz(torque)]
+    outward = np.tril(np.ones((n, n)))  # sums over links k, k + 1, ...
+    sums = jnp.matmul(
+        jnp.stack(own), jnp.asarray(outward, arm.p.dtype), precision="highest"
     )
-    composite = jnp.matmul(spatial, outer, precision="highest")
-    Mq = joint_metric(arm.S, composite) + jnp.diag(jnp.asarray(robot.armature))
-    bias = joint_forces(arm.S, jnp.matmul(wrench, outer, precision="highest"))
-    return Mq, bias
-
-
-def _mv(R: Array, x: Array) -> Array:
-    return jnp.einsum("nij,nj->ni", R, x, precision="highest")
-
-
-def _apply(inertia: Array, w: Array) -> Array:
-    return jnp.sum(inertia * w[None], axis=1)
-
-
-def _skew(c: Array) -> Array:
-    zero = jnp.zeros_like(c[0])
-    return jnp.stack(
-        [
-            jnp.stack([zero, -c[2], c[1]]),
-            jnp.stack([c[2], zero, -c[0]]),
-            jnp.stack([-c[1], c[0], zero]),
-        ]
+    mass, moment = sums[0], Vec.of(sums[1:4], 0)
+    xx, xy, xz, yy, yz, zz = sums[4:10]
+    inertia = (Vec(xx, xy, xz), Vec(xy, yy, yz), Vec(xz, yz, zz))
+    S = arm.S
+    momentum = Motion(
+        S.lin * mass + S.ang.cross(moment),
+        moment.cross(S.lin) + Vec(*(row @ S.ang for row in inertia)),
     )
+    rotors = jnp.diag(jnp.asarray(robot.armature, arm.p.dtype))
+    Mq = add_once(joint_metric(S, momentum), rotors)
+    return Mq, joint_forces(S, sums[10:])
+
+
+def _world_inertia(robot: Robot, arm: ArmState) -> tuple[Vec, Vec, Vec]:
+    """Rows of R I R^T for every link, about its centre of mass."""
+    inertia = np.asarray(robot.inertia)
+    R = [Vec.of(arm.R[i], 0) for i in range(3)]
+    RI = [
+        Vec(
+            *(
+                row.x * inertia[:, 0, j] + row.y * inertia[:, 1, j]
+                + row.z * inertia[:, 2, j]
+                for j in range(3)
+            )
+        )
+        for row in R
+    ]
+    a, b, c = RI
+    xy, xz, yz = a @ R[1], a @ R[2], b @ R[2]
+    return Vec(a @ R[0], xy, xz), Vec(xy, b @ R[1], yz), Vec(xz, yz, c @ R[2])
+
+
+def _xyz(v: Vec) -> tuple[Array, Array, Array]:
+    return v.x, v.y, v.z

@@ -26,21 +26,55 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.robot.model import Robot
+from rmp_mjx.vec import Vec
+
+
+@struct.dataclass
+class Motion:
+    """Spatial motion vectors (twists, joint columns, accelerations), one per column."""
+
+    lin: Vec
+    """Linear part: velocity of the body point at the base point."""
+    ang: Vec
+    """Angular part."""
+
+    @staticmethod
+    def of(array: Float[Array, "6 n"]) -> Motion:
+        """Split (6, n), linear part first."""
+        return Motion(Vec.of(array[:3], 0), Vec.of(array[3:], 0))
+
+    def stack(self) -> Float[Array, "6 n"]:
+        """Join into (6, n), linear part first."""
+        return jnp.concatenate([self.lin.stack(), self.ang.stack()])
+
+    def at(self, x: Vec) -> Vec:
+        """Linear part at the points x."""
+        return self.lin + self.ang.cross(x)
+
+    def rate(self, S: Motion) -> Motion:
+        """Rate of change of motion vectors S that these twists carry along."""
+        return Motion(
+            self.ang.cross(S.lin) + self.lin.cross(S.ang), self.ang.cross(S.ang)
+        )
+
+    def __mul__(self, s: Array) -> Motion:
+        """Product with a scalar per column."""
+        return Motion(self.lin * s, self.ang * s)
 
 
 @struct.dataclass
 class ArmState:
     """Where every joint frame is and how it moves."""
 
-    p: Float[Array, "n 3"]
+    p: Float[Array, "3 n"]
     """Origins of the joint frames relative to `base_point` [m]."""
-    R: Float[Array, "n 3 3"]
+    R: Float[Array, "3 3 n"]
     """Orientations of the joint frames in the world."""
-    S: Float[Array, "6 n"]
+    S: Motion
     """Joint columns: the twist of every outer link per unit of joint velocity."""
-    V: Float[Array, "6 n"]
+    V: Motion
     """Twist of each link [m/s, rad/s]."""
-    A: Float[Array, "6 n"]
+    A: Motion
     """Spatial acceleration of each link while qdd = 0 [m/s^2, rad/s^2]."""
 
 
@@ -51,7 +85,7 @@ def base_point(robot: Robot) -> Float[Array, " 3"]:
 
 def forward_kinematics(
     robot: Robot, q: Float[Array, " n"]
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
+) -> tuple[Float[Array, "3 n"], Float[Array, "3 3 n"]]:
     """Joint frames relative to `base_point`.
 
     One constant transform and one turn about (or shift along) z per joint. The
@@ -63,7 +97,7 @@ def forward_kinematics(
         q: Joint coordinates, (n,) [rad or m].
 
     Returns:
-        Origins (n, 3) [m] and world orientations (n, 3, 3).
+        Origins (3, n) [m] and world orientations (3, 3, n).
     """
     shift = jnp.asarray(q) - robot.q_ref
     c, s = jnp.cos(shift), jnp.sin(shift)
@@ -81,45 +115,41 @@ def forward_kinematics(
         p, R = jax.lax.optimization_barrier((p, R))
         origins.append(p)
         rotations.append(R)
-    return jnp.stack(origins), jnp.stack(rotations)
+    return jnp.stack(origins, axis=-1), jnp.stack(rotations, axis=-1)
 
 
 def arm_state(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> ArmState:
     """Frames, joint columns, twists and bias accelerations of the whole chain."""
     p, R = forward_kinematics(robot, q)
-    z = R[:, :, 2].T
+    z = Vec.of(R[:, 2], 0)
     hinge = np.array(robot.hinge)
-    S = jnp.concatenate(
-        [jnp.where(hinge, jnp.cross(p.T, z, axis=0), z), jnp.where(hinge, z, 0.0)]
+    S = Motion(
+        Vec.of(p, 0).cross(z).map(lambda turn, slide: jnp.where(hinge, turn, slide), z),
+        z.map(lambda turn: jnp.where(hinge, turn, 0.0)),
     )
     inner = np.triu(np.ones((robot.n, robot.n)))
-    V = _dot(S * qd, inner)
-    A = _dot(cross_motion(V, S) * qd, inner)
+    V = Motion.of(_dot((S * qd).stack(), inner))
+    A = Motion.of(_dot((V.rate(S) * qd).stack(), inner))
     return ArmState(p=p, R=R, S=S, V=V, A=A)
 
 
-def cross_motion(V: Float[Array, "6 n"], S: Float[Array, "6 n"]) -> Float[Array, "6 n"]:
-    """Rate of change of motion vectors S carried along by the twists V."""
-    v, w = V[:3], V[3:]
-    return jnp.concatenate(
-        [
-            jnp.cross(w, S[:3], axis=0) + jnp.cross(v, S[3:], axis=0),
-            jnp.cross(w, S[3:], axis=0),
-        ]
-    )
-
-
-def joint_forces(S: Float[Array, "6 n"], W: Float[Array, "6 n"]) -> Float[Array, " n"]:
+def joint_forces(S: Motion, W: Float[Array, "6 n"]) -> Float[Array, " n"]:
     """Joint forces of composite wrenches: column k sums the wrenches of links >= k."""
-    return jnp.sum(S * W, axis=0)
+    W = Motion.of(W)
+    return S.lin @ W.lin + S.ang @ W.ang
 
 
-def joint_metric(
-    S: Float[Array, "6 n"], M: Float[Array, "6 6 n"]
-) -> Float[Array, "n n"]:
-    """Joint-space metric of composite 6x6 metrics (column k sums links >= k)."""
-    F = jnp.sum(M * S[None], axis=1)
-    G = jnp.einsum("ij,ik->jk", S, F, precision="highest")
+def joint_metric(S: Motion, F: Motion) -> Float[Array, "n n"]:
+    """Joint-space metric :math:`S_j \\cdot F_k` from composite momenta.
+
+    Column k of F is the composite 6x6 metric of links >= k times joint column k.
+    """
+
+
+    def outer(a: Vec, b: Vec) -> Array:
+        return a.map(lambda c: c[:, None]) @ b
+
+    G = outer(S.lin, F.lin) + outer(S.ang, F.ang)
     upper = np.triu(np.ones(G.shape, bool))
     return jnp.where(upper, G, G.T)
 
@@ -151,26 +181,58 @@ def site_pose(
 ) -> tuple[Float[Array, " 3"], Float[Array, "3 3"]]:
     """World position (3,) [m] and orientation (3, 3) of the end-effector site."""
     p, R = forward_kinematics(robot, q)
-    position = base_point(robot) + p[-1] + _dot(R[-1], robot.site_offset)
-    return position, _dot(R[-1], robot.site_rotation)
+    position = base_point(robot) + p[:, -1] + _dot(R[..., -1], robot.site_offset)
+    return position, _dot(R[..., -1], robot.site_rotation)
 
 
 def site_state(robot: Robot, arm: ArmState) -> SiteState:
     """Pose, velocity, Jacobians and curvature of the site."""
-    x = arm.p[-1] + _dot(arm.R[-1], robot.site_offset)
-    v0, w = arm.V[:3, -1], arm.V[3:, -1]
-    a0, alpha = arm.A[:3, -1], arm.A[3:, -1]
-    v = v0 + jnp.cross(w, x)
+    R = arm.R[..., -1]
+    x = arm.p[:, -1] + _dot(R, robot.site_offset)
+    V, A = (jax.tree.map(lambda c: c[-1], motion) for motion in (arm.V, arm.A))
+    at = Vec.of(x)
+    v = V.at(at)
     return SiteState(
         p=base_point(robot) + x,
-        R=_dot(arm.R[-1], robot.site_rotation),
-        v=v,
-        w=w,
-        J_pos=arm.S[:3] + jnp.cross(arm.S[3:], x[:, None], axis=0),
-        J_ori=arm.S[3:],
-        Jdot_qd_pos=a0 + jnp.cross(alpha, x) + jnp.cross(w, v),
-        Jdot_qd_ori=alpha,
+        R=_dot(R, robot.site_rotation),
+        v=v.stack(),
+        w=V.ang.stack(),
+        J_pos=arm.S.at(at).stack(),
+        J_ori=arm.S.ang.stack(),
+        Jdot_qd_pos=(A.at(at) + V.ang.cross(v)).stack(),
+        Jdot_qd_ori=A.ang.stack(),
     )
+
+
+def carry_points(
+    robot: Robot, arm: ArmState, offset: np.ndarray, segment: np.ndarray
+) -> tuple[Vec, np.ndarray]:
+    """Move points with their links: three products with constant matrices.
+
+    Args:
+        robot: The arm.
+        arm: Its state.
+        offset: Points in the frames of their joints, (k, 3) [m]; in the world frame
+            for segment -1.
+        segment: Joint that moves each point, (k,); -1 for the fixed base.
+
+    Returns:
+        Positions relative to the base point, and which joint carries which point,
+        one-hot (n, k): `select` with it gives the twist that moves each point.
+    """
+    carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
+    axes = np.concatenate([offset.T[:, None] * carrier, carrier[None]])
+    frames = jnp.concatenate([arm.R, arm.p[:, None]], axis=1)
+    x = _dot(frames.reshape(3, -1), axes.reshape(-1, len(segment)))
+    if (segment < 0).any():
+        fixed = (offset - np.asarray(robot.offset[0])) * (segment < 0)[:, None]
+        x = x + jnp.asarray(fixed.T, x.dtype)
+    return Vec.of(x, 0), carrier
+
+
+def select(motion: Motion, carrier: np.ndarray) -> Motion:
+    """Linear combinations of the columns of motion vectors, by a matrix (n, k)."""
+    return Motion.of(_dot(motion.stack(), carrier))
 
 
 def _dot(a: Array, b: Array) -> Array:

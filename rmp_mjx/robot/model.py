@@ -188,6 +188,8 @@ class Robot:
             (k for k in range(model.nkey) if model.key(k).name == "home"), None
         )
         q_home = model.qpos0 if key is None else model.key_qpos[key]
+        for k in list(spec.keys):  # q_home keeps what matters of them
+            spec.delete(k)
         prev_p = np.vstack([np.zeros(3), frames_p[:-1]])
         prev_R = np.concatenate([np.eye(3)[None], frames_R[:-1]])
         return Robot(

@@ -8,7 +8,14 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.rmp import RMP
-from rmp_mjx.robot.kinematics import ArmState, joint_forces, joint_metric
+from rmp_mjx.robot.kinematics import (
+    ArmState,
+    Motion,
+    carry_points,
+    joint_forces,
+    joint_metric,
+    select,
+)
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.vec import Vec
 
@@ -55,23 +62,13 @@ class PointRMP:
 
 
 def point_state(robot: Robot, arm: ArmState) -> PointState:
-    """Move the control points with the links.
-
-    A point's position is linear in its link's (R, p), its velocity and acceleration
-    in the link's twist and bias: three matrix products with constant matrices.
-    """
-    offset = np.asarray(robot.points.offset)
-    carry = _carrier(robot)
-    placed = np.concatenate([carry[:, None] * offset.T[None], carry[:, None]], axis=1)
-    frames = jnp.concatenate([arm.R, arm.p[:, :, None]], axis=2)
-    frames = jnp.swapaxes(frames, 0, 1).reshape(3, -1)
-    x = Vec.of(_matmul(frames, placed.reshape(-1, offset.shape[0])), 0)
-    twist = _matmul(arm.V, carry)
-    bias = _matmul(arm.A, carry)
-    w = Vec.of(twist[3:], 0)
-    v = Vec.of(twist[:3], 0) + w.cross(x)
-    a = Vec.of(bias[:3], 0) + Vec.of(bias[3:], 0).cross(x) + w.cross(v)
-    return PointState(x, v, a)
+    """Move the control points with the links."""
+    x, carrier = carry_points(
+        robot, arm, np.asarray(robot.points.offset), np.array(robot.points.segment, int)
+    )
+    V, A = select(arm.V, carrier), select(arm.A, carrier)
+    v = V.at(x)
+    return PointState(x, v, A.at(x) + V.ang.cross(v))
 
 
 def pull_to_joints(
@@ -80,59 +77,46 @@ def pull_to_joints(
     r"""Pull the points' RMPs back to the joints (RMPflow pullback, natural form).
 
     Each point's :math:`f - M \dot J \dot q` and M become a wrench and a 6x6 metric
-    about the base point, which are summed over all points that move with or beyond
-    each joint and then contracted with the joint columns.
+    about the base point,
+
+    .. math:: \begin{pmatrix} M & M [x]_\times^T \\ [x]_\times M &
+        [x]_\times M [x]_\times^T \end{pmatrix},
+
+    which are summed over all points that move with or beyond each joint and then
+    contracted with the joint columns.
 
     Returns:
         RMP on the joints; f (n,), M (n, n).
     """
     x, rows = points.x, rmp.rows
     force = rmp.f - Vec(*(row @ points.a for row in rows))
-    moment = x.cross(force)
-    # [x] M, column by column (M is symmetric), and [x] M [x]^T, row by row.
-    columns = [x.cross(row) for row in rows]
-    turned = [
-        x.cross(Vec(columns[0].x, columns[1].x, columns[2].x)),
-        x.cross(Vec(columns[0].y, columns[1].y, columns[2].y)),
-        x.cross(Vec(columns[0].z, columns[1].z, columns[2].z)),
-    ]
-    fields = [*_parts(force), *_parts(moment)]
+    # Columns of [x] M are x cross the rows of M (symmetric); then once more by rows.
+    a, b, c = (x.cross(row) for row in rows)
+    turned = [x.cross(Vec(*row)) for row in zip(_xyz(a), _xyz(b), _xyz(c), strict=True)]
+    fields = [*_xyz(force), *_xyz(x.cross(force))]
     fields += [rmp.xx, rmp.xy, rmp.xz, rmp.yy, rmp.yz, rmp.zz]
-    for column in columns:
-        fields += _parts(column)
+    fields += [*_xyz(a), *_xyz(b), *_xyz(c)]
     fields += [turned[0].x, turned[0].y, turned[0].z]
     fields += [turned[1].y, turned[1].z, turned[2].z]
-    outward = np.cumsum(_carrier(robot)[::-1], axis=0)[::-1].T
-    sums = _matmul(jnp.stack(jnp.broadcast_arrays(*fields)), outward)
-    metric = sums[_METRIC_ORDER]
-    return RMP(
-        f=joint_forces(arm.S, sums[:6]),
-        M=joint_metric(arm.S, metric.reshape(6, 6, -1)),
-    )
-
-
-_METRIC_ORDER = np.array(
-    # linear-linear | linear-angular (= its transpose), symmetric 6x6, row by row
-    [
-        [6, 7, 8, 12, 13, 14],
-        [7, 9, 10, 15, 16, 17],
-        [8, 10, 11, 18, 19, 20],
-        [12, 15, 18, 21, 22, 23],
-        [13, 16, 19, 22, 24, 25],
-        [14, 17, 20, 23, 25, 26],
-    ]
-).reshape(-1)
-
-
-def _carrier(robot: Robot) -> np.ndarray:
-    """Which joint moves each point: one-hot (n, p)."""
     segment = np.array(robot.points.segment, int)
-    return (np.arange(robot.n)[:, None] == segment[None]).astype(float)
+    outward = (np.arange(robot.n) <= segment[:, None]).astype(float)
+    sums = jnp.matmul(
+        jnp.stack(jnp.broadcast_arrays(*fields)),
+        jnp.asarray(outward, arm.p.dtype),
+        precision="highest",
+    )
+    xx, xy, xz, yy, yz, zz = sums[6:12]
+    a, b, c = (Vec.of(sums[i : i + 3], 0) for i in (12, 15, 18))
+    txx, txy, txz, tyy, tyz, tzz = sums[21:27]
+    lin, ang = arm.S.lin, arm.S.ang
+    momentum = Motion(
+        Vec(Vec(xx, xy, xz) @ lin, Vec(xy, yy, yz) @ lin, Vec(xz, yz, zz) @ lin)
+        + Vec(a @ ang, b @ ang, c @ ang),
+        a * lin.x + b * lin.y + c * lin.z
+        + Vec(Vec(txx, txy, txz) @ ang, Vec(txy, tyy, tyz) @ ang, Vec(txz, tyz, tzz) @ ang),
+    )
+    return RMP(f=joint_forces(arm.S, sums[:6]), M=joint_metric(arm.S, momentum))
 
 
-def _parts(v: Vec) -> list[Array]:
-    return [v.x, v.y, v.z]
-
-
-def _matmul(a: Array, b: np.ndarray) -> Array:
-    return jnp.matmul(a, jnp.asarray(b, a.dtype), precision="highest")
+def _xyz(v: Vec) -> tuple[Array, Array, Array]:
+    return v.x, v.y, v.z

@@ -111,9 +111,7 @@ class Checkpointer:
         )
         self._manager.wait_until_finished()
 
-    def restore(
-        self, template: Any, note: Callable[[str], None]
-    ) -> tuple[int, Any]:
+    def restore(self, template: Any, note: Callable[[str], None]) -> tuple[int, Any]:
         """Read the newest sound checkpoint.
 
         Args:

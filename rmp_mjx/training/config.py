@@ -92,8 +92,41 @@ class TrainConfig:
 
 # May differ between a run and its continuation; everything else defines the run.
 RESUMABLE = frozenset(
-    "num_timesteps run_dir resume overwrite log_interval checkpoint_interval "
-    "checkpoints_kept eval_episodes eval_deterministic video".split()
+    {
+        "num_timesteps",
+        "run_dir",
+        "resume",
+        "overwrite",
+        "log_interval",
+        "checkpoint_interval",
+        "checkpoints_kept",
+        "eval_episodes",
+        "eval_deterministic",
+        "video",
+    }
+)
+AT_LEAST_ONE = (
+    "num_envs",
+    "num_timesteps",
+    "unroll_length",
+    "num_minibatches",
+    "num_updates_per_batch",
+    "log_interval",
+    "checkpoint_interval",
+    "checkpoints_kept",
+)
+POSITIVE = (
+    "learning_rate",
+    "value_learning_rate",
+    "clipping_epsilon",
+    "max_grad_norm",
+)
+NOT_NEGATIVE = (
+    "entropy_cost",
+    "vf_coefficient",
+    "target_kl",
+    "eval_episodes",
+    "seed",
 )
 
 
@@ -121,17 +154,13 @@ def validate(config: TrainConfig, known_envs: Iterable[str]) -> TrainConfig:
     _known(config.env, "env", sorted(known_envs))
     _known(config.controller, "controller", CONTROLLERS)
     _known(config.physics, "physics", PHYSICS)
-    at_least_one = (
-        "num_envs num_timesteps unroll_length num_minibatches num_updates_per_batch "
-        "log_interval checkpoint_interval checkpoints_kept"
-    )
-    for name in at_least_one.split():
+    for name in AT_LEAST_ONE:
         if getattr(config, name) < 1:
             raise ConfigError(f"{name} must be at least 1, is {getattr(config, name)}")
-    for name in "learning_rate value_learning_rate clipping_epsilon max_grad_norm".split():
+    for name in POSITIVE:
         if not getattr(config, name) > 0.0:
             raise ConfigError(f"{name} must be positive, is {getattr(config, name)}")
-    for name in "entropy_cost vf_coefficient target_kl eval_episodes seed".split():
+    for name in NOT_NEGATIVE:
         if not getattr(config, name) >= 0:
             raise ConfigError(f"{name} must not be negative: {getattr(config, name)}")
     for name in ("discounting", "gae_lambda"):

@@ -1,13 +1,13 @@
 """Per-episode values: per-step metrics folded over an episode."""
 
 from collections.abc import Mapping
-from typing import Literal
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-Reduction = Literal["sum", "max", "mean", "last"]
+REDUCTIONS = ("sum", "max", "mean", "last")
+"""How per-step values can fold into an episode's."""
 
 
 @struct.dataclass
@@ -22,12 +22,20 @@ class EpisodeFold:
     """Partial fold of each per-step metric."""
 
 
-def _initial(reduction: Reduction) -> float:
+def _initial(reduction: str) -> float:
     return -jnp.inf if reduction == "max" else 0.0
 
 
-def start(reductions: Mapping[str, Reduction], shape: tuple[int, ...]) -> EpisodeFold:
-    """An empty fold for a batch of environments."""
+def start(reductions: Mapping[str, str], shape: tuple[int, ...]) -> EpisodeFold:
+    """An empty fold for a batch of environments.
+
+    Raises:
+        ValueError: A reduction is not one of `REDUCTIONS`.
+    """
+    for name, reduction in reductions.items():
+        if reduction not in REDUCTIONS:
+            known = ", ".join(REDUCTIONS)
+            raise ValueError(f"metric {name!r}: reduction {reduction!r}, not {known}")
     return EpisodeFold(
         reward=jnp.zeros(shape, jnp.float32),
         length=jnp.zeros(shape, jnp.int32),
@@ -42,11 +50,11 @@ def update(
     fold: EpisodeFold,
     reward: Float[Array, "*b"],
     metrics: Mapping[str, Float[Array, "*b"]],
-    reductions: Mapping[str, Reduction],
+    reductions: Mapping[str, str],
 ) -> EpisodeFold:
     """Add one step. Every metric named in `reductions` must be present."""
 
-    def add(name: str, reduction: Reduction):
+    def add(name: str, reduction: str):
         old, new = fold.metrics[name], metrics[name]
         if reduction == "max":
             return jnp.maximum(old, new)
@@ -60,7 +68,7 @@ def update(
 
 
 def finish(
-    fold: EpisodeFold, reductions: Mapping[str, Reduction]
+    fold: EpisodeFold, reductions: Mapping[str, str]
 ) -> dict[str, Float[Array, "*b"]]:
     """Per-episode values: `return`, `length` and every metric."""
     length = fold.length.astype(jnp.float32)
@@ -74,7 +82,7 @@ def finish(
 
 
 def restart(
-    fold: EpisodeFold, done: Bool[Array, "*b"], reductions: Mapping[str, Reduction]
+    fold: EpisodeFold, done: Bool[Array, "*b"], reductions: Mapping[str, str]
 ) -> EpisodeFold:
     """Empty the folds of the environments that are done."""
     return EpisodeFold(

@@ -15,7 +15,7 @@ from rmp_mjx.training.rollout import Env, cast_like, finite_step, select
 from rmp_mjx.training.stats import bootstrap_mean, clopper_pearson, mean_sd
 
 Episodes = dict[str, np.ndarray]
-"""One value per episode: `return`, `length`, `nonfinite`, and every metric."""
+"""One value per episode: `return`, `length`, `lost` (non-finite), and every metric."""
 
 
 def run_episodes(
@@ -49,24 +49,22 @@ def _run(env: Env, agent: Agent, num: int, key: PRNGKeyArray) -> dict[str, Any]:
         return ~done.all() & (t < env.episode_length)
 
     def step(carry):
-        state, fold, done, nonfinite, t = carry
+        state, fold, done, lost, t = carry
         action = agent(state.obs, jax.random.fold_in(key_act, t))
         new, finite = finite_step(env, state, action)
         new_fold = episodes.update(fold, new.reward, new.metrics, kinds)
         state = select(done, state, cast_like(new, state))
         fold = select(done, fold, new_fold)
-        nonfinite |= ~done & ~finite
-        return state, fold, done | (state.done > 0.5), nonfinite, t + 1
+        lost |= ~done & ~finite
+        return state, fold, done | (state.done > 0.5), lost, t + 1
 
     nobody = jnp.zeros(num, bool)
     start = (first, episodes.start(kinds, (num,)), nobody, nobody, jnp.int32(0))
-    _, fold, _, nonfinite, _ = jax.lax.while_loop(unfinished, step, start)
-    return episodes.finish(fold, kinds) | {"nonfinite": nonfinite}
+    _, fold, _, lost, _ = jax.lax.while_loop(unfinished, step, start)
+    return episodes.finish(fold, kinds) | {"lost": lost}
 
 
-def summarise(
-    results: Episodes, reductions: Mapping[str, episodes.Reduction]
-) -> dict[str, Any]:
+def summarise(results: Episodes, reductions: Mapping[str, str]) -> dict[str, Any]:
     """Statistics of evaluation episodes.
 
     Rates carry 95 % Clopper-Pearson intervals (`..._rate_ci95`), the mean return a
@@ -91,7 +89,7 @@ def summarise(
         "return_mean_ci95": list(bootstrap_mean(returns)),
         "length_mean": float(results["length"].mean()),
         "steps": int(results["length"].sum()),
-        "nonfinite_episodes": int(results["nonfinite"].sum()),
+        "lost_episodes": int(results["lost"].sum()),
     }
 
     def rate(name: str, hits: int) -> None:

@@ -79,12 +79,13 @@ class RunLogger:
         self._task = self._progress.add_task(
             "", total=num_iterations, completed=first_iteration, shown="compiling"
         )
-        self._first = first_iteration
-        self._began = time.monotonic()
+        self._first: tuple[int, float] | None = None
         self._printed = self._written = -float("inf")
 
     def __enter__(self) -> "RunLogger":
         self._progress.start()
+        if not self._console.is_terminal:
+            self.note("compiling")
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -106,18 +107,25 @@ class RunLogger:
                 self._tensorboard.add_scalar(name, value, int(row["steps"] or 0))
         self._progress.update(self._task, completed=iteration, shown=self._shown())
         now = time.monotonic()
+        self._first = self._first or (iteration, now)
         last = iteration >= self._total
         if now - self._written > WRITE_INTERVAL:
             self.flush()
         plain = not self._console.is_terminal
         if plain and (last or now - self._printed > PLAIN_INTERVAL):
             self._printed = now
-            done = iteration - self._first
-            eta = (now - self._began) / max(done, 1) * (self._total - iteration)
             self.note(
-                f"{iteration}/{self._total} steps {row['steps']:,} "
-                f"eta {eta:.0f} s {self._shown()}"
+                f"{iteration}/{self._total} steps {row['steps']:,}"
+                f"{self._eta(iteration, now)} {self._shown()}"
             )
+
+    def _eta(self, iteration: int, now: float) -> str:
+        """Time left at the pace since the first row, which contains the compiling."""
+        first, began = self._first or (iteration, now)
+        if iteration == first:
+            return ""
+        left = (now - began) / (iteration - first) * (self._total - iteration)
+        return f" eta {left:.0f} s"
 
     def _shown(self) -> str:
         return " ".join(

@@ -38,13 +38,15 @@ def make_networks(
         Brax's bundle of policy network, value network and action distribution.
     """
 
-    def preprocess(obs, statistics):
-        return running_statistics.normalize(obs, statistics, max_abs_value=OBS_LIMIT)
+    def preprocess(observation, preprocessor_params):
+        return running_statistics.normalize(
+            observation, preprocessor_params, max_abs_value=OBS_LIMIT
+        )
 
     return ppo_networks.make_ppo_networks(
         observation_size,
         action_size,
-        preprocess_observations_fn=preprocess,
+        preprocess_observations_fn=preprocess,  # pyright: ignore[reportArgumentType]
         policy_hidden_layer_sizes=hidden_sizes,
         value_hidden_layer_sizes=hidden_sizes,
         activation=linen.tanh,

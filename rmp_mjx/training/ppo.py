@@ -1,9 +1,11 @@
-"""Proximal policy optimisation: one pure function per iteration.
+"""Proximal policy optimisation as pure functions of one state.
 
-`make_ppo` returns two functions, `init(key)` and `iterate(state)`; all that training
-needs to go on is in the `TrainState` between them, so a restored state continues as
-if it had never been interrupted. Both are pure: jit, vmap over seeds and sharding
-are the caller's.
+`make_ppo` returns `init(key)`, then an iteration in its two halves, `gather(state)`
+and `learn(state, data)`, and whole, `iterate(state)`. All that training needs to go
+on is in the `TrainState` between them, so a restored state continues as if it had
+never been interrupted. jit, vmap over seeds and sharding are the caller's. The halves
+exist because a simulator that runs as a host callback keeps its program out of the
+persistent compile cache: on its own, the learner is compiled once per machine.
 """
 
 from collections.abc import Callable
@@ -59,15 +61,24 @@ class TrainState:
     """Finished iterations."""
 
 
+Metrics = dict[str, Float[Array, ""]]
+
+
 class PPO(NamedTuple):
     """The functions of one training problem."""
 
     networks: PPONetworks
+    """Policy, value function and action distribution."""
     init: Callable[[PRNGKeyArray], TrainState]
-    iterate: Callable[
-        [TrainState],
-        tuple[TrainState, rollout.RolloutStats, dict[str, Float[Array, ""]]],
+    """First state."""
+    gather: Callable[
+        [TrainState], tuple[TrainState, rollout.Transition, rollout.RolloutStats]
     ]
+    """Let the policy act; moves the environments and the key."""
+    learn: Callable[[TrainState, rollout.Transition], tuple[TrainState, Metrics]]
+    """Learn from what was gathered; moves the rest."""
+    iterate: Callable[[TrainState], tuple[TrainState, rollout.RolloutStats, Metrics]]
+    """Both, one after the other."""
 
 
 def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
@@ -81,8 +92,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
         config: Validated configuration.
 
     Returns:
-        The networks, `init(key) -> TrainState` and
-        `iterate(state) -> (state, rollout statistics, learning metrics)`.
+        The networks and the functions.
     """
     networks = make_networks(
         env.observation_size,
@@ -131,7 +141,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
             config.entropy_cost,
             config.vf_coefficient,
         )
-        norms = [optax.global_norm(grad) for grad in grads]
+        norms = [optax.tree.norm(grad) for grad in grads]
         usable = jnp.isfinite(norms[0]) & jnp.isfinite(norms[1])
 
         def apply(optimizer, grad, opt, params, allowed):
@@ -158,7 +168,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
         learner = Learner(policy, value, policy_opt, value_opt)
         return (learner, may_update, policy_may), parts
 
-    def learn(learner, normalizer, batch: Batch, key, may_update):
+    def update(learner, normalizer, batch: Batch, key, may_update):
         size = config.steps_per_iteration
 
         def epoch(carry, key):
@@ -192,12 +202,13 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
         metrics["kl"] = parts["kl"][-1]
         return learner, metrics
 
-    def iterate(state: TrainState):
-        key, key_unroll, key_learn = jax.random.split(state.key, 3)
-        learner, normalizer = state.learner, state.normalizer
+    def gather(state: TrainState):
+        key, key_unroll = jax.random.split(state.key)
 
         def act(obs, key):
-            logits = networks.policy_network.apply(normalizer, learner.policy, obs)
+            logits = networks.policy_network.apply(
+                state.normalizer, state.learner.policy, obs
+            )
             raw = distribution.sample_no_postprocessing(logits, key)
             extras = {
                 "raw_action": raw,
@@ -208,6 +219,11 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
         roll, data, stats = rollout.unroll(
             env, act, state.rollout, key_unroll, config.unroll_length
         )
+        return state.replace(rollout=roll, key=key), data, stats
+
+    def learn(state: TrainState, data: rollout.Transition):
+        key, key_learn = jax.random.split(state.key)
+        learner, normalizer = state.learner, state.normalizer
 
         def value(obs):
             outputs = networks.value_network.apply(normalizer, learner.value, obs)
@@ -237,7 +253,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
             weight=data.weight,
         )
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
-        learner, metrics = learn(
+        learner, metrics = update(
             learner, normalizer, batch, key_learn, state.iteration > 0
         )
         spread = weighted_mean(
@@ -261,10 +277,15 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
             learner=learner,
             normalizer=normalizer,
             scale=scale,
-            rollout=roll,
+            rollout=state.rollout,
             key=key,
             iteration=state.iteration + 1,
         )
+        return state, metrics
+
+    def iterate(state: TrainState):
+        state, data, stats = gather(state)
+        state, metrics = learn(state, data)
         return state, stats, metrics
 
-    return PPO(networks=networks, init=init, iterate=iterate)
+    return PPO(networks, init, gather, learn, iterate)

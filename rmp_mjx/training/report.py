@@ -7,8 +7,14 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from jaxtyping import PRNGKeyArray
 from rich.console import Console
 from rich.table import Table
+
+from rmp_mjx import runtime
+from rmp_mjx.training import evaluate
+from rmp_mjx.training.networks import Agent
+from rmp_mjx.training.rollout import Env
 
 GROUPS = ("episode/", "per_1000_steps/")
 HIDDEN = ("episode/finished",)
@@ -79,20 +85,27 @@ def write_video(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
     mediapy.write_video(str(path), frames, fps=fps)
 
 
-def try_video(render: Any, states: list, path: Path, fps: float, con: Console) -> None:
-    """Render states and write the video, or say in one line why there is none.
+def film(
+    env: Env, agent: Agent, key: PRNGKeyArray, path: Path, console: Console, render: Any
+) -> None:
+    """Render one episode to a video, or say in one line why there is none.
 
     Args:
-        render: Called with the states; gives frames.
-        states: States of an episode.
+        env: Single environment.
+        agent: Batched agent.
+        key: Randomness of the start and the actions.
         path: MP4 file to write.
-        fps: Frames per second.
-        con: Terminal.
+        console: Terminal.
+        render: Called as `render(env, states)`; gives frames (h, w, 3) uint8.
     """
+    if runtime.choose_gl() is None:
+        console.print("no video: no headless rendering here (neither EGL nor OSMesa)")
+        return
     try:
-        write_video(render(states), path, fps)
+        frames = render(env, evaluate.record_episode(env, agent, key))
+        write_video(frames, path, fps=1.0 / env.dt)
     except Exception as error:  # graphics stacks fail in many ways; numbers are safe
         reason = " ".join(str(error).split())[:160] or type(error).__name__
-        con.print(f"no video: rendering failed here ({reason})", markup=False)
+        console.print(f"no video: {reason}", markup=False, highlight=False)
     else:
-        con.print(f"video: {path}", markup=False)
+        console.print(f"video: {path}", markup=False, highlight=False)

@@ -18,17 +18,37 @@ class Env(Protocol):
     """A single environment in Brax's convention; callers vmap it."""
 
     @property
-    def observation_size(self) -> int: ...
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        ...
+
     @property
-    def action_size(self) -> int: ...
+    def action_size(self) -> int:
+        """Length of an action."""
+        ...
+
     @property
-    def dt(self) -> float: ...
+    def dt(self) -> float:
+        """Time of a policy step [s]."""
+        ...
+
     @property
-    def episode_length(self) -> int: ...
+    def episode_length(self) -> int:
+        """Policy steps after which an episode is cut off."""
+        ...
+
     @property
-    def metric_reductions(self) -> Mapping[str, episodes.Reduction]: ...
-    def reset(self, rng: PRNGKeyArray) -> Any: ...
-    def step(self, state: Any, action: Float[Array, " m"]) -> Any: ...
+    def metric_reductions(self) -> Mapping[str, str]:
+        """How each per-step metric folds into an episode's value."""
+        ...
+
+    def reset(self, rng: PRNGKeyArray) -> Any:
+        """A fresh start: a state with obs, reward, done and metrics."""
+        ...
+
+    def step(self, state: Any, action: Float[Array, " m"]) -> Any:
+        """One policy step; done is 1 where the task itself ends."""
+        ...
 
 
 @struct.dataclass
@@ -137,10 +157,10 @@ def init(env: Env, num_envs: int, key: PRNGKeyArray) -> RolloutState:
 def init_stats(env: Env) -> RolloutStats:
     """Sums before the first step."""
     kinds = env.metric_reductions
-    zero = jnp.float32(0.0)
+    zero = jnp.zeros((), jnp.float32)
     return RolloutStats(
         episodes=jnp.int32(0),
-        episode_sums={name: zero for name in ("return", "length", *kinds)},
+        episode_sums=dict.fromkeys(("return", "length", *kinds), zero),
         step_sums={name: zero for name, kind in kinds.items() if kind == "sum"},
         nonfinite=jnp.int32(0),
     )

@@ -31,7 +31,27 @@ CURVE = "learning_curve.png"
 VIDEO = "video.mp4"
 EVALUATION = "eval.json"
 LOCK = "lock"
-RESULTS = (CONFIG, VERSIONS, METRICS, CHECKPOINTS, TENSORBOARD, CURVE, VIDEO, EVALUATION)
+PACKAGES = (
+    "jax",
+    "jaxlib",
+    "brax",
+    "flax",
+    "optax",
+    "mujoco",
+    "mujoco-mjx",
+    "numpy",
+    "rmp-mjx",
+)
+RESULTS = (
+    CONFIG,
+    VERSIONS,
+    METRICS,
+    CHECKPOINTS,
+    TENSORBOARD,
+    CURVE,
+    VIDEO,
+    EVALUATION,
+)
 
 
 def default_run_dir(config: TrainConfig) -> Path:
@@ -96,22 +116,32 @@ def _lock(folder: Path) -> IO[str]:
     return lock
 
 
-def describe(folder: Path, config: TrainConfig) -> None:
-    """Write the configuration and the versions that a run used.
+def describe(folder: Path, config: TrainConfig) -> list[str]:
+    """Write the configuration and the versions that a run uses.
 
-    A resumed run keeps what it was started with; its own versions are added.
+    A resumed run adds its versions to those that it was started with.
+
+    Returns:
+        What has changed since the run was last continued: a resumed run is
+        bit-identical to an uninterrupted one only where this is empty.
     """
     save_config(config, folder / CONFIG)
     path = folder / VERSIONS
     history = json.loads(path.read_text()) if path.exists() else []
-    path.write_text(json.dumps([*history, versions()], indent=2) + "\n")
+    now = versions()
+    path.write_text(json.dumps([*history, now], indent=2) + "\n")
+    before = history[-1] if history else now
+    return [
+        f"{name} {before.get(name)} -> {now[name]}"
+        for name in (*PACKAGES, "python", "git", "device")
+        if before.get(name) != now[name]
+    ]
 
 
 def versions() -> dict[str, str]:
     """What this process runs on: packages, code, device, command line."""
-    packages = "jax jaxlib brax flax optax mujoco mujoco-mjx numpy rmp-mjx".split()
     found = {}
-    for name in packages:
+    for name in PACKAGES:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

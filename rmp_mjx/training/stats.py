@@ -7,9 +7,7 @@ from scipy import stats as scipy_stats
 Interval = tuple[float, float]
 
 
-def clopper_pearson(
-    successes: int, trials: int, confidence: float = 0.95
-) -> Interval:
+def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> Interval:
     """Exact binomial confidence interval (Clopper and Pearson, 1934).
 
     Args:

@@ -40,6 +40,8 @@ class TrainResult:
     """Finished iterations."""
     exit_code: int
     """0, or 128 plus the signal that stopped it."""
+    had_finished: bool
+    """Whether there was nothing left to do."""
 
 
 def train(
@@ -61,11 +63,14 @@ def train(
         TrainingFailure: The simulation or the learner became non-finite.
     """
     ppo = make_ppo(env, config)
-    iterate = jax.jit(ppo.iterate, donate_argnums=0)
+    gather = jax.jit(ppo.gather, donate_argnums=0)
+    learn = jax.jit(ppo.learn, donate_argnums=0)
     checkpoints = Checkpointer(folder / run_folder.CHECKPOINTS, config.checkpoints_kept)
     console = console or Console()
     state, done = _start(ppo, config, checkpoints, console)
-    run_folder.describe(folder, config)
+    changes = run_folder.describe(folder, config)
+    if changes:
+        console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)
     logger = RunLogger(
         folder / run_folder.METRICS,
         folder / run_folder.TENSORBOARD,
@@ -73,11 +78,12 @@ def train(
         done,
         console,
     )
-    saved = done
+    first = saved = done
     with StopRequest() as stop, logger:
         while done < config.num_iterations and not stop.signal:
             began = time.monotonic()
-            state, stats, learning = iterate(state)
+            state, data, stats = gather(state)
+            state, learning = learn(state, data)
             jax.block_until_ready(state)
             done += 1
             row = make_row(
@@ -109,7 +115,12 @@ def train(
         state.learner.policy,
         config.eval_deterministic,
     )
-    return TrainResult(agent=agent, iterations=done, exit_code=stop.exit_code)
+    return TrainResult(
+        agent=agent,
+        iterations=done,
+        exit_code=stop.exit_code,
+        had_finished=first >= config.num_iterations,
+    )
 
 
 def _start(

@@ -62,9 +62,7 @@ def test_pushforward_gives_the_motion_of_the_child_along_a_trajectory(make):
     # 1e-6 and 2e-6: h^2 truncation with derivatives up to 1e2; rounding is
     # 1e-16 / h^2 = 1e-8.
     np.testing.assert_allclose(pushed.xd, velocity, atol=1e-6)
-    np.testing.assert_allclose(
-        pushed.J @ XDD + pushed.Jdot_qd, acceleration, atol=2e-6
-    )
+    np.testing.assert_allclose(pushed.J @ XDD + pushed.Jdot_qd, acceleration, atol=2e-6)
 
 
 def test_identity_map_changes_nothing():

@@ -56,8 +56,10 @@ class PaperCollision(ScalarLeaf):
     ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
         """Force and metric at distances ``x`` and speeds ``xd``, elementwise."""
         sign = -1.0 if self.signs == "corrected" else 1.0
-        gap = jnp.maximum(x - self.margin, self.x_min)
-        m = jnp.minimum((jnp.maximum(sign * xd, 0.0) / (gap * gap)) ** 2, self.cap)
+        there = jnp.isfinite(x)
+        gap = jnp.where(there, jnp.maximum(x - self.margin, self.x_min), 1.0)
+        gate = jnp.where(there, jnp.maximum(sign * xd, 0.0), 0.0)
+        m = jnp.minimum((gate / (gap * gap)) ** 2, self.cap)
         return m * (sign * self.eta * xd), m
 
 

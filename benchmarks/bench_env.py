@@ -1,0 +1,114 @@
+"""Speed of the trajectory task: policy steps a second on each physics engine.
+
+Run as ``python -m benchmarks.bench_env --json FILE``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import jax
+
+import envs
+from benchmarks.common import Row, measure, show, write_json
+from rmp_mjx import runtime
+
+ENGINES = ("mjx", "mujoco")
+SIZES = (256, 1024, 2048)
+WARM_UP = 10  # random policy steps before timing, so that the arms are moving
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """Read the options."""
+    parser = argparse.ArgumentParser(description="Environment speed.")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--quick", action="store_true", help="a smoke test: one size")
+    parser.add_argument("--seed", type=int, default=0, help="of states and actions")
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        action="append",
+        help="measure only this physics engine; may be repeated (default: all)",
+    )
+    return parser.parse_args(argv)
+
+
+def measure_engine(
+    engine: str, sizes: tuple[int, ...], seed: int, seconds: float
+) -> list[Row]:
+    """Rows of one engine.
+
+    Args:
+        engine: Physics engine.
+        sizes: Numbers of environments.
+        seed: Of start states and actions.
+        seconds: Time to spend on each size. [s]
+    """
+    env = envs.load("trajectory", controller="rmp_vices", physics=engine)
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.vmap(env.step)
+    substeps = f"{env.n_substeps} x {env.sim_dt * 1e3:g} ms"
+    walk = jax.jit(lambda s, a: jax.lax.scan(lambda s, a: (step(s, a), 0), s, a)[0])
+    rows = []
+    for size in sizes:
+        key_reset, key_action = jax.random.split(jax.random.key(seed))
+        state = reset(jax.random.split(key_reset, size))
+        actions = jax.random.uniform(
+            key_action, (WARM_UP + 1, size, env.action_size), minval=-1.0, maxval=1.0
+        )
+        state = jax.block_until_ready(walk(state, actions[:-1]))
+        timing = measure(step, state, actions[-1], seconds=seconds)
+        rate = size / timing.median
+        note = f"substeps {substeps}; {timing.spread}"
+        rows.append(Row(f"env_steps_per_s_{engine}_{size}", rate, "1/s", note))
+        physics = rate * env.n_substeps
+        rows.append(Row(f"physics_steps_per_s_{engine}_{size}", physics, "1/s", note))
+        if size == sizes[-1]:
+            alone = controller_time(env, state, actions[-1], seconds)
+            share, compile_s = alone / timing.median, timing.compile_s
+            note = f"{size} environments, no compile cache"
+            rows.append(Row(f"env_compile_s_{engine}", compile_s, "s", note))
+            note = f"{size} environments; controller timed alone"
+            rows.append(Row(f"controller_share_of_step_{engine}", share, "", note))
+    return rows
+
+
+def controller_time(env, state, action, seconds: float) -> float:
+    """Seconds that the controller's evaluations of one policy step take alone."""
+    ctrl, n = env.controller, env.robot.n
+
+    def torques(data, placed, action):
+        obstacles = env.obstacles(data, placed)
+        q, qd = data.qpos[:n], data.qvel[:n]
+        setpoint = ctrl.setpoint(q, ctrl.decode(action))
+
+        def substep(qd, _):
+            tau = ctrl(q, qd, setpoint, obstacles).tau
+            # The next evaluation depends on this one, as it does behind physics.
+            return qd + 1e-9 * tau, None
+
+        return jax.lax.scan(substep, qd, None, length=env.n_substeps)[0]
+
+    batched = jax.vmap(torques)
+    args = (state.data, state.info["placed"], action)
+    return measure(batched, *args, seconds=seconds).median
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, print, and write where asked to."""
+    args = parse(argv)
+    runtime.configure(compile_cache=False)
+    sizes, seconds = ((64,), 1.0) if args.quick else (SIZES, 10.0)
+    rows = []
+    for engine in args.engine or ENGINES:
+        rows += measure_engine(engine, sizes, args.seed, seconds)
+    show(rows, "Trajectory task, RMP-VICES")
+    if args.json:
+        sizes_text = ", ".join(map(str, sizes))
+        write_json(
+            args.json, rows, seed=args.seed, num_envs=sizes_text, quick=args.quick
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Batched manipulation tasks. `load` makes one by name."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+
+from envs.base import ArmEnv as ArmEnv
+from envs.base import State as State
+from envs.trajectory import Trajectory
+
+ENVS: dict[str, type[ArmEnv]] = {"trajectory": Trajectory}
+"""Tasks by name."""
+
+
+def names() -> tuple[str, ...]:
+    """The tasks that `load` knows."""
+    return tuple(ENVS)
+
+
+def load(name: str, **options) -> ArmEnv:
+    """Make a task.
+
+    Args:
+        name: One of `names()`.
+        **options: The task's keyword arguments, for instance `controller`, `physics`,
+            `obstacles`; see the task's class.
+
+    Raises:
+        ValueError: Unknown task, option, or value; the message lists the valid ones.
+    """
+    if name not in ENVS:
+        raise ValueError(_unknown("env", name, names()))
+    valid = [p for p in inspect.signature(ENVS[name]).parameters]
+    for option in options:
+        if option not in valid:
+            raise ValueError(_unknown(f"option of '{name}'", option, valid))
+    return ENVS[name](**options)
+
+
+def _unknown(kind: str, name: str, valid) -> str:
+    near = difflib.get_close_matches(name, valid, n=1)
+    hint = f" Did you mean '{near[0]}'?" if near else ""
+    return f"unknown {kind} '{name}'; valid names: {', '.join(valid)}.{hint}"

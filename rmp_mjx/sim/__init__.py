@@ -1,0 +1,35 @@
+"""Interchangeable physics engines behind one small interface."""
+
+from __future__ import annotations
+
+import jax
+import mujoco
+
+from rmp_mjx.sim.base import Contacts as Contacts
+from rmp_mjx.sim.base import Physics as Physics
+from rmp_mjx.sim.base import PhysicsError as PhysicsError
+from rmp_mjx.sim.base import PhysicsState as PhysicsState
+from rmp_mjx.sim.base import read_contacts as read_contacts
+from rmp_mjx.sim.base import watch_pairs as watch_pairs
+
+NAMES = ("auto", "mujoco", "mjx")
+"""What `load_physics` accepts: `auto` is `mujoco` on a CPU and `mjx` elsewhere."""
+
+
+def load_physics(name: str, model: mujoco.MjModel) -> Physics:
+    """The named engine with this model.
+
+    Raises:
+        PhysicsError: Unknown name, or a model the engine cannot simulate.
+    """
+    if name not in NAMES:
+        raise PhysicsError(f"unknown physics '{name}'; valid names: {', '.join(NAMES)}")
+    if name == "auto":
+        name = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    if name == "mujoco":
+        from rmp_mjx.sim.mujoco_c import MujocoPhysics
+
+        return MujocoPhysics(model)
+    from rmp_mjx.sim.mjx import MjxPhysics
+
+    return MjxPhysics(model)

@@ -1,0 +1,122 @@
+"""The interface every physics engine stands behind."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+PAIR_SENSOR = "touch/"
+"""Prefix of the contact sensors that watch one geom pair each."""
+
+CONTACTS_PER_PAIR = 2
+"""Contact slots a pair sensor reports: a capsule on a plane touches at two points."""
+
+_FIELDS = (
+    mujoco.mjtConDataField.mjCONDATA_FOUND,  # 1 number
+    mujoco.mjtConDataField.mjCONDATA_FORCE,  # 3, normal first
+    mujoco.mjtConDataField.mjCONDATA_DIST,  # 1
+)
+_WIDTH = 5
+
+
+class PhysicsError(ValueError):
+    """The engine is unknown, is missing, or cannot simulate this model."""
+
+
+@struct.dataclass
+class PhysicsState:
+    """All that must be carried from one physics step to the next."""
+
+    qpos: Float[Array, " nq"]
+    """Generalised positions."""
+    qvel: Float[Array, " nv"]
+    """Generalised velocities."""
+    warmstart: Float[Array, " nv"]
+    """Last acceleration, from which the constraint solver starts."""
+    mocap_pos: Float[Array, "k 3"]
+    """World positions of the obstacles the scene moves (mocap bodies) [m]."""
+    sensors: Float[Array, " s"]
+    """Contact sensors of the last step."""
+
+
+@struct.dataclass
+class Contacts:
+    """Contact of every watched geom pair in one physics step."""
+
+    touching: Bool[Array, " pairs"]
+    """Whether the pair's surfaces overlap."""
+    force: Float[Array, " pairs"]
+    """Sum of the pair's normal forces [N]."""
+
+
+class Physics(Protocol):
+    """One engine with one model. All methods are pure, single-environment, vmappable."""
+
+    model: mujoco.MjModel
+
+    def init(
+        self, qpos: Array, qvel: Array, mocap_pos: Array | None = None
+    ) -> PhysicsState:
+        """State at rest in the given pose, nothing simulated yet."""
+        ...
+
+    def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
+        """Advance by ``model.opt.timestep`` under actuator controls (nu,)."""
+        ...
+
+
+def init_state(
+    model: mujoco.MjModel, qpos: Array, qvel: Array, mocap_pos: Array | None
+) -> PhysicsState:
+    """The state all engines start from."""
+    qpos = jnp.asarray(qpos)
+    if mocap_pos is None:
+        mocap_pos = jnp.asarray(model.body_pos[model.body_mocapid >= 0], qpos.dtype)
+    return PhysicsState(
+        qpos=qpos,
+        qvel=jnp.asarray(qvel, qpos.dtype),
+        warmstart=jnp.zeros(model.nv, qpos.dtype),
+        mocap_pos=jnp.asarray(mocap_pos, qpos.dtype),
+        sensors=jnp.zeros(model.nsensordata, qpos.dtype),
+    )
+
+
+def watch_pairs(spec: mujoco.MjSpec, pairs: list[tuple[str, str]], condim: int) -> None:
+    """Make contact explicit: only these geom pairs collide, each with its sensor.
+
+    Args:
+        spec: Scene to edit. All its geoms stop colliding by type.
+        pairs: Geom names.
+        condim: 1 for frictionless contact, 3 for friction.
+    """
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    for a, b in pairs:
+        spec.add_pair(name=f"{a}/{b}", geomname1=a, geomname2=b, condim=condim)
+        sensor = spec.add_sensor(name=f"{PAIR_SENSOR}{a}/{b}")
+        sensor.type = mujoco.mjtSensor.mjSENS_CONTACT
+        sensor.objtype = sensor.reftype = mujoco.mjtObj.mjOBJ_GEOM
+        sensor.objname, sensor.refname = a, b
+        sensor.intprm[0] = sum(1 << int(field) for field in _FIELDS)
+        sensor.intprm[1] = 0  # no reduction: every contact of the pair
+        sensor.intprm[2] = CONTACTS_PER_PAIR
+
+
+def read_contacts(model: mujoco.MjModel, state: PhysicsState) -> Contacts:
+    """Contacts of the watched pairs, in the order given to `watch_pairs`."""
+    ids = [
+        s for s in range(model.nsensor) if model.sensor(s).name.startswith(PAIR_SENSOR)
+    ]
+    width = _WIDTH * CONTACTS_PER_PAIR
+    address = model.sensor_adr[ids][:, None] + np.arange(width)
+    rows = state.sensors[address.reshape(-1)].reshape(-1, CONTACTS_PER_PAIR, _WIDTH)
+    touching = (rows[..., 0] > 0) & (rows[..., 4] < 0)
+    return Contacts(
+        touching=jnp.any(touching, axis=1),
+        force=jnp.sum(jnp.where(touching, rows[..., 1], 0.0), axis=1),
+    )

@@ -1,0 +1,6 @@
+"""Training and evaluation of policies on any environment of the Brax convention.
+
+* `config`, `cli`: the options; `run_folder`: what a run leaves behind.
+* `ppo`: the algorithm as pure functions; `train`: the loop around it.
+* `evaluate`, `report`: episodes, their statistics, tables, plots and videos.
+"""

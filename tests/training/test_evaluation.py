@@ -1,0 +1,79 @@
+"""Evaluation: one episode per environment, exact, reproducible."""
+
+import jax
+import numpy as np
+import pytest
+
+from rmp_mjx.training import evaluate
+from rmp_mjx.training.networks import random_agent, zero_agent
+from rmp_mjx.training.train import load_agent
+from tests.training import toys
+
+EPISODES = 12
+KEY = jax.random.key(3)
+
+
+@pytest.fixture(scope="module")
+def results():
+    env = toys.Counter()
+    return evaluate.run_episodes(env, random_agent(1), EPISODES, KEY)
+
+
+def test_every_environment_runs_exactly_one_episode(results):
+    env = toys.Counter()
+    starts = jax.vmap(env.reset)(
+        jax.random.split(jax.random.split(KEY)[0], EPISODES)
+    ).obs
+    lengths = np.asarray(starts[:, 0])
+    reached = lengths <= env.episode_length
+    assert 0 < reached.sum() < EPISODES
+    np.testing.assert_array_equal(
+        results["length"], np.minimum(lengths, env.episode_length)
+    )
+    np.testing.assert_array_equal(results["return"], -1.0 * reached)
+    np.testing.assert_array_equal(results["collision"], reached)
+    assert not results["lost"].any()
+
+
+def test_agents_with_the_same_key_meet_the_same_tasks(results):
+    other = evaluate.run_episodes(toys.Counter(), zero_agent(1), EPISODES, KEY)
+    np.testing.assert_array_equal(other["length"], results["length"])
+    assert (other["effort"] == 0.0).all()
+    assert (results["effort"] > 0.0).all()
+
+
+def test_the_summary_counts_what_the_episodes_say(results):
+    summary = evaluate.summarise(results, toys.Counter().metric_reductions)
+    hits = int(results["collision"].sum())
+    assert summary["episodes"] == EPISODES
+    assert summary["return_mean"] == pytest.approx(-hits / EPISODES)
+    assert summary["collision_episodes"] == hits
+    low, high = summary["collision_rate_ci95"]
+    assert low < summary["collision_rate"] == hits / EPISODES < high
+    steps = results["length"].sum()
+    assert summary["collision_per_1000_steps"] == pytest.approx(1000 * hits / steps)
+    assert summary["success_rate"] == 0.0
+    assert summary["effort_max"] == pytest.approx(float(results["effort"].max()))
+
+
+def test_an_episode_that_becomes_nonfinite_is_lost_and_counted():
+    env = toys.Exploding()
+    results = evaluate.run_episodes(env, zero_agent(1), EPISODES, KEY)
+    assert 0 < results["lost"].sum() < EPISODES
+    assert np.isfinite(results["return"]).all()
+
+
+def test_a_loaded_policy_acts_as_the_trained_one(finished):
+    folder, result, config = finished
+    step, agent = load_agent(toys.Counter(), config, folder, True, pytest.fail)
+    obs = jax.random.normal(KEY, (5, 3))
+    assert step == result.iterations
+    np.testing.assert_array_equal(agent(obs, KEY), result.agent(obs, KEY))
+
+
+def test_a_recorded_episode_starts_at_the_reset_and_ends_when_done():
+    states = evaluate.record_episode(toys.Counter(), zero_agent(1), KEY)
+    assert float(states[0].obs[1]) == 0.0
+    assert [float(s.obs[1]) for s in states] == list(range(len(states)))
+    ended = float(states[-1].done) == 1.0
+    assert ended or len(states) == toys.Counter().episode_length + 1
