@@ -125,7 +125,10 @@ def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
             if name == "controller":
                 points = len(robot.control_points)
                 note = f"{points} points x {SPHERES} spheres; {note}"
-            rows.append(Row(f"{name}_{row.key}{suffix}", row.value, row.unit, note))
+            key = f"{name}_{row.key}"
+            if row.key == "compile_s":
+                key = f"compile_s_{name}"
+            rows.append(Row(key + suffix, row.value, row.unit, note))
     return rows
 
 

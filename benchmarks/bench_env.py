@@ -67,7 +67,7 @@ def measure_engine(
             alone = controller_time(env, state, actions[-1], seconds)
             share, compile_s = alone / timing.median, timing.compile_s
             note = f"{size} environments, no compile cache"
-            rows.append(Row(f"env_compile_s_{engine}", compile_s, "s", note))
+            rows.append(Row(f"compile_s_env_{engine}", compile_s, "s", note))
             note = f"{size} environments; controller timed alone"
             rows.append(Row(f"controller_share_of_step_{engine}", share, "", note))
     return rows

@@ -22,8 +22,8 @@ import jax
 # From jaxlib 0.10.0 until 0.11.0 XLA's CPU fusion recomputes a whole kinematic chain at
 # every link: mjx.kinematics of a 7-joint arm goes from a few microseconds to several
 # milliseconds or more per environment. Later releases neither need nor know the first
-# flag, and XLA aborts the process on a flag that it does not know, so the flags are tied
-# to exactly the releases they were tried on.
+# flag, and XLA aborts the process on a flag that it does not know, so the flags are
+# tied to exactly the releases they were tried on.
 _CPU_FLAGS = (
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_cpu_experimental_ynn_fusion_type=",

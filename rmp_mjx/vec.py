@@ -89,10 +89,12 @@ def sum_all(terms: tuple[Array, ...]) -> tuple[Array, ...]:
     return tuple(jax.lax.reduce(terms, zeros, add, (0,)))
 
 
-def add_once(*terms: Array) -> Array:
-    """Sum arrays of one shape into a value that is stored, not recomputed by its users.
+def store(x: Array) -> Array:
+    """The same array, computed once and stored instead of recomputed by its users.
 
-    XLA's CPU backend fuses a plain sum, and all that leads to it, into every element
-    of every consumer; a reduction ends the fusion.
+    XLA's CPU backend fuses whatever leads to a small matrix into every element of
+    every consumer, and drops `optimization_barrier` before it fuses. A reduction of
+    two operands ends the fusion and is not simplified away.
     """
-    return jnp.sum(jnp.stack(terms), axis=0)
+    padded = jnp.stack([x, jnp.zeros_like(x)])
+    return sum_all((padded, padded))[0]

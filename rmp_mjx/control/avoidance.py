@@ -18,7 +18,7 @@ from rmp_mjx.robot.kinematics import (
 )
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, PointState, point_state, pull_to_joints
-from rmp_mjx.vec import Vec, add_once, sum_all
+from rmp_mjx.vec import Vec, store, sum_all
 
 
 def obstacle_branch(
@@ -105,7 +105,7 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
     between = (joints > segment[1][:, None]) & (joints <= segment[0][:, None])
     rows = jnp.sum(w.stack()[:, :, None] * arm.S.stack()[:, None, :], axis=0)
     rows = jnp.where(between, rows, 0.0)
-    f, m = add_once(f, -m * curvature), add_once(m, jnp.zeros_like(m))
+    f, m, rows = store(f - m * curvature), store(m), store(rows)
     return RMP(
         f=jnp.sum(rows * f[:, None], axis=0),
         M=jnp.sum((rows * m[:, None])[:, :, None] * rows[:, None, :], axis=0),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+
+
+import functools
+import operator
 
 import jax
+from typing import Any
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
@@ -23,7 +27,7 @@ from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_pose, site_state
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
-from rmp_mjx.vec import add_once
+from rmp_mjx.vec import store
 
 
 @struct.dataclass
@@ -120,7 +124,7 @@ class RMPVICES:
                 branches.append(self.joint_limit(q, qd))
             if self.posture is not None:
                 branches.append(self.posture(q, qd, Mq))
-            root = jax.tree.map(add_once, *branches)
+            root = jax.tree.map(store, functools.reduce(operator.add, branches))
         qdd = resolve(root, self.regularizer * Mq)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
         tau, scale = scale_torque(dynamic, bias, self.robot.tau_max)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 CONTROLLERS = ("rmp_vices", "vices")
-PHYSICS = ("mujoco", "mjx")
+PHYSICS = ("auto", "mujoco", "mjx")
 
 
 class ConfigError(ValueError):
@@ -22,8 +22,8 @@ class TrainConfig:
     """Task to learn."""
     controller: str = "rmp_vices"
     """Low-level controller that the policy commands: rmp_vices or vices."""
-    physics: str = "mujoco"
-    """Physics engine: mujoco (C, for CPUs) or mjx (JAX, for accelerators)."""
+    physics: str = "auto"
+    """Physics engine: mujoco (C threads), mjx (JAX), or auto: mujoco on a CPU."""
     num_envs: int = 256
     """Environments that run in parallel."""
     num_timesteps: int = 500_000

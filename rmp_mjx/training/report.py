@@ -27,7 +27,9 @@ def write_json(values: dict[str, Any], path: Path) -> None:
 
 
 def _number(value: Any) -> str:
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}"
+    if isinstance(value, int) or abs(value) >= 1000.0:
+        return f"{value:,.0f}"
+    return f"{value:.4g}"
 
 
 def table(summary: dict[str, Any], title: str) -> Table:
