@@ -31,7 +31,7 @@ def load(name: str, **options) -> ArmEnv:
     """
     if name not in ENVS:
         raise ValueError(_unknown("env", name, names()))
-    valid = [p for p in inspect.signature(ENVS[name]).parameters]
+    valid = list(inspect.signature(ENVS[name]).parameters)
     for option in options:
         if option not in valid:
             raise ValueError(_unknown(f"option of '{name}'", option, valid))

@@ -87,7 +87,7 @@ class ArmEnv(abc.ABC):
                     f"{', '.join(CONTROLLERS)}"
                 )
             controller = CONTROLLERS[controller](robot)
-        self.controller = controller
+        self.controller: RMPVICES | VICES = controller
         self.scene = scene
         self.physics = load_physics(physics, scene.model)
         self.sim_dt = sim_dt
@@ -123,9 +123,7 @@ class ArmEnv(abc.ABC):
         if not self.scene.spheres:
             return slots
         radius = self.scene.model.geom("sphere_0").size[0]
-        slots = slots.with_spheres(
-            data.mocap_pos, np.full(self.scene.spheres, radius)
-        )
+        slots = slots.with_spheres(data.mocap_pos, np.full(self.scene.spheres, radius))
         spheres = slots.spheres.replace(active=active)
         return slots.replace(spheres=spheres)
 
@@ -140,9 +138,7 @@ class ArmEnv(abc.ABC):
             data, record = carry
             out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, obstacles)
             data = self.physics.step(data, out.tau)
-            now = observe(
-                self.scene, self.robot, data, out.diagnostics["torque_scale"]
-            )
+            now = observe(self.scene, self.robot, data, out.diagnostics["torque_scale"])
             return (data, record.then(now, 1.0 / self.n_substeps)), None
 
         start = (data, SafetyRecord.none())

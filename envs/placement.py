@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rmp_mjx.types import Constant
+
 CANDIDATES = 64
 """Placements drawn at once; the first that satisfies the rules is taken."""
 
@@ -20,8 +22,8 @@ surface to the arm at the start of the episode."""
 def sample_apart(
     rng: Array,
     count: int,
-    low: Float[Array, " 3"],
-    high: Float[Array, " 3"],
+    low: Float[Constant, " 3"],
+    high: Float[Constant, " 3"],
     gap: float,
 ) -> tuple[Float[Array, "count 3"], Bool[Array, ""]]:
     """Points in a box, at least `gap` from each other.
@@ -43,11 +45,11 @@ def place_spheres(
     count: int,
     radius: float,
     layout: str,
-    low: Float[Array, " 3"],
-    high: Float[Array, " 3"],
+    low: Float[Constant, " 3"],
+    high: Float[Constant, " 3"],
     points: Float[Array, "v 3"],
     arm_points: Float[Array, "p 3"],
-    arm_radii: Float[Array, " p"],
+    arm_radii: Float[Constant, " p"],
 ) -> tuple[Float[Array, "count 3"], Bool[Array, " count"]]:
     """Sphere centres in a box that keep the layout's clearances.
 

@@ -362,6 +362,8 @@ def _fill(slots, **contents):
     filled = {"active": jnp.arange(total) < k}
     for name, value in contents.items():
         old = getattr(slots, name)
-        new = jnp.zeros_like(old[:k]) if value is None else jnp.asarray(value, old.dtype)
+        new = (
+            jnp.zeros_like(old[:k]) if value is None else jnp.asarray(value, old.dtype)
+        )
         filled[name] = old.at[:k].set(jnp.broadcast_to(new, old[:k].shape))
     return slots.replace(**filled)

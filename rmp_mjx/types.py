@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
+
+# Constants are float64 NumPy arrays until traced, so that they serve any precision.
+if TYPE_CHECKING:
+    from typing import Any as Constant
+else:
+    Constant = Array | np.ndarray
 
 
 @struct.dataclass

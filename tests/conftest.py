@@ -45,3 +45,11 @@ _own_cache = pytest.StashKey[Path]()
 def root() -> Path:
     """The checkout."""
     return ROOT
+
+
+@pytest.fixture(scope="session")
+def robot():
+    """The Jaco 2 as it ships."""
+    from rmp_mjx import Robot
+
+    return Robot.load()

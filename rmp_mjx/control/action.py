@@ -40,7 +40,10 @@ class ActionRange:
         ratio = self.kp_max / jnp.asarray(self.kp_min, u.dtype)
         kp = self.kp_min * ratio ** (0.5 * (u[6:] + 1.0))
         return Action(
-            dpos=self.dpos * u[:3], drot=self.drot * u[3:6], kp_pos=kp[:3], kp_ori=kp[3:]
+            dpos=self.dpos * u[:3],
+            drot=self.drot * u[3:6],
+            kp_pos=kp[:3],
+            kp_ori=kp[3:],
         )
 
 

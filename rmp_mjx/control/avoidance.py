@@ -17,7 +17,7 @@ from rmp_mjx.robot.kinematics import (
     select,
 )
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.robot.point_state import PointRMP, PointState, point_state, pull_to_joints
+from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
 from rmp_mjx.vec import Vec, store, sum_all
 
 
@@ -82,13 +82,13 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
     if not capsules.pairs:
         return RMP.zero(n, arm.p.dtype)
     ids = np.array(capsules.pairs).T
-    segment, radii = np.array(capsules.segment)[ids], np.asarray(capsules.radius)[ids]
+    segment, radii = np.array(capsules.segment)[ids], capsules.radius[ids]
     far, near = (np.arange(n)[:, None] == s for s in segment)
     V, A = (select(motion, 1.0 * far - near) for motion in (arm.V, arm.A))
 
     # The four ends of each pair, far then near, and their velocities.
     ends = [(end, side) for side in (0, 1) for end in (capsules.start, capsules.end)]
-    offset = np.concatenate([np.asarray(end)[ids[side]] for end, side in ends])
+    offset = jnp.concatenate([end[ids[side]] for end, side in ends])
     x, carrier = carry_points(robot, arm, offset, np.repeat(segment, 2, axis=0).ravel())
     v = select(arm.V, carrier).at(x)
 
@@ -100,7 +100,7 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
     (w, norm), (wdot, _) = jax.jvp(unit_wrench, (x,), (v,))
     rate = w.lin @ V.lin + w.ang @ V.ang
     curvature = w.lin @ A.lin + w.ang @ A.ang + wdot.lin @ V.lin + wdot.ang @ V.ang
-    f, m = leaf.scalar(norm - radii.sum(0), rate)
+    f, m = leaf.scalar(norm - jnp.sum(radii, axis=0), rate)
     joints = np.arange(n)
     between = (joints > segment[1][:, None]) & (joints <= segment[0][:, None])
     rows = jnp.sum(w.stack()[:, :, None] * arm.S.stack()[:, None, :], axis=0)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-
-
 import functools
 import operator
+from typing import Any
 
 import jax
-from typing import Any
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
@@ -24,7 +22,13 @@ from rmp_mjx.rmp.leaves.collision import collision_near
 from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_pose, site_state
+from rmp_mjx.robot.kinematics import (
+    ArmState,
+    SiteState,
+    arm_state,
+    site_pose,
+    site_state,
+)
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 from rmp_mjx.vec import store
@@ -50,14 +54,14 @@ class RMPVICES:
 
     robot: Robot
     """The arm."""
-    collision: ScalarLeaf | None | Any = ...
+    collision: ScalarLeaf | Any | None = ...
     """Leaf between every control point and obstacle; its parameters may be arrays that
     broadcast against (obstacles, points)."""
-    self_collision: ScalarLeaf | None | Any = ...
+    self_collision: ScalarLeaf | Any | None = ...
     """Leaf between the link capsules that can touch."""
-    joint_limit: ScalarLeaf | None | Any = ...
+    joint_limit: ScalarLeaf | Any | None = ...
     """Leaf on the joints."""
-    posture: Posture | None | Any = ...
+    posture: Posture | Any | None = ...
     """Rest configuration, in the inertia metric: fills the null space."""
     attractor_weight: Float[Array, ""] | float = 1.0
     """Metric of the two impedance attractors."""

@@ -120,9 +120,7 @@ def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: ScalarLeaf) -> Siblin
 
     nodes = [
         node(jnp.asarray(o), jnp.asarray(h, o.dtype), r)
-        for o, h, r in zip(
-            np.asarray(points.offset), one_hot, np.asarray(points.radius), strict=True
-        )
+        for o, h, r in zip(points.offset, one_hot, points.radius, strict=True)
     ]
     return Siblings.stack(nodes)
 
@@ -164,7 +162,7 @@ def _self_node(robot: Robot, leaf: ScalarLeaf) -> Node:
     """All capsule pairs as one node: the distances of the pairs that can touch."""
     capsules = robot.capsules
     ids = np.array(capsules.pairs).T
-    radii = np.asarray(capsules.radius)[ids].sum(0)
+    radii = jnp.sum(capsules.radius[ids], axis=0)
 
     def distances(q):
         p, R = forward_kinematics(robot, q)
@@ -192,7 +190,9 @@ def _segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     s = (ab * (db @ r) - (da @ r) * bb) / safe
     t = (aa * (db @ r) - (da @ r) * ab) / safe
     crossing = skewed & (s > 0) & (s < 1) & (t > 0) & (t < 1)
-    inner = safe_norm(r + jnp.where(crossing, s, 0.0) * da - jnp.where(crossing, t, 0.0) * db)
+    inner = safe_norm(
+        r + jnp.where(crossing, s, 0.0) * da - jnp.where(crossing, t, 0.0) * db
+    )
     ends = jnp.stack(
         [
             _point_segment(a0, b0, db),
@@ -206,5 +206,7 @@ def _segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
 
 def _point_segment(x: Array, start: Array, along: Array) -> Array:
     length2 = along @ along
-    t = jnp.clip((x - start) @ along / jnp.where(length2 > 1e-9, length2, 1.0), 0.0, 1.0)
+    t = jnp.clip(
+        (x - start) @ along / jnp.where(length2 > 1e-9, length2, 1.0), 0.0, 1.0
+    )
     return safe_norm(x - start - t * along)

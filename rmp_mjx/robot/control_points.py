@@ -5,18 +5,20 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from rmp_mjx.types import Constant
 
 
 @struct.dataclass
 class Capsules:
     """Link capsules in the frames of the joints that move them."""
 
-    start: Float[Array, "c 3"]
+    start: Float[Constant, "c 3"]
     """One end of the axis [m]; world frame for the fixed base."""
-    end: Float[Array, "c 3"]
+    end: Float[Constant, "c 3"]
     """The other end [m]."""
-    radius: Float[Array, " c"]
+    radius: Float[Constant, " c"]
     """Radius [m]."""
     segment: tuple[int, ...] = struct.field(pytree_node=False)
     """Joint that moves the capsule; -1 for the fixed base."""
@@ -30,11 +32,11 @@ class Capsules:
 class ControlPoints:
     """Spheres inscribed in the link capsules."""
 
-    offset: Float[Array, "p 3"]
+    offset: Float[Constant, "p 3"]
     """Centre in the joint frame [m]."""
-    radius: Float[Array, " p"]
+    radius: Float[Constant, " p"]
     """Radius [m]."""
-    body_offset: Float[Array, "p 3"]
+    body_offset: Float[Constant, "p 3"]
     """Centre in the MJCF body's frame [m]."""
     segment: tuple[int, ...] = struct.field(pytree_node=False)
     """Joint that moves the point."""

@@ -31,7 +31,7 @@ def dynamics(
     """
     n = robot.n
     mass = jnp.asarray(robot.mass, arm.p.dtype)
-    c, _ = carry_points(robot, arm, np.asarray(robot.com), np.arange(n))
+    c, _ = carry_points(robot, arm, robot.com, np.arange(n))
     rows = _world_inertia(robot, arm)
     w, alpha = arm.V.ang, arm.A.ang
     gravity = Vec.of(jnp.asarray(robot.gravity, arm.p.dtype))
@@ -72,12 +72,13 @@ def dynamics(
 
 def _world_inertia(robot: Robot, arm: ArmState) -> tuple[Vec, Vec, Vec]:
     """Rows of R I R^T for every link, about its centre of mass."""
-    inertia = np.asarray(robot.inertia)
+    inertia = jnp.asarray(robot.inertia, arm.R.dtype)
     R = [Vec.of(arm.R[i], 0) for i in range(3)]
     RI = [
         Vec(
             *(
-                row.x * inertia[:, 0, j] + row.y * inertia[:, 1, j]
+                row.x * inertia[:, 0, j]
+                + row.y * inertia[:, 1, j]
                 + row.z * inertia[:, 2, j]
                 for j in range(3)
             )

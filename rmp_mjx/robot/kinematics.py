@@ -26,6 +26,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.robot.model import Robot
+from rmp_mjx.types import Constant
 from rmp_mjx.vec import Vec
 
 
@@ -135,16 +136,15 @@ def arm_state(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> Ar
 
 def joint_forces(S: Motion, W: Float[Array, "6 n"]) -> Float[Array, " n"]:
     """Joint forces of composite wrenches: column k sums the wrenches of links >= k."""
-    W = Motion.of(W)
-    return S.lin @ W.lin + S.ang @ W.ang
+    w = Motion.of(W)
+    return S.lin @ w.lin + S.ang @ w.ang
 
 
 def joint_metric(S: Motion, F: Motion) -> Float[Array, "n n"]:
-    """Joint-space metric :math:`S_j \\cdot F_k` from composite momenta.
+    r"""Joint-space metric :math:`S_j \cdot F_k` from composite momenta.
 
     Column k of F is the composite 6x6 metric of links >= k times joint column k.
     """
-
 
     def outer(a: Vec, b: Vec) -> Array:
         return a.map(lambda c: c[:, None]) @ b
@@ -205,7 +205,7 @@ def site_state(robot: Robot, arm: ArmState) -> SiteState:
 
 
 def carry_points(
-    robot: Robot, arm: ArmState, offset: np.ndarray, segment: np.ndarray
+    robot: Robot, arm: ArmState, offset: Constant, segment: np.ndarray
 ) -> tuple[Vec, np.ndarray]:
     """Move points with their links: three products with constant matrices.
 
@@ -220,13 +220,14 @@ def carry_points(
         Positions relative to the base point, and which joint carries which point,
         one-hot (n, k): `select` with it gives the twist that moves each point.
     """
+    offset = jnp.asarray(offset, arm.p.dtype)
     carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
-    axes = np.concatenate([offset.T[:, None] * carrier, carrier[None]])
+    axes = jnp.concatenate([offset.T[:, None] * carrier, carrier[None]])
     frames = jnp.concatenate([arm.R, arm.p[:, None]], axis=1)
     x = _dot(frames.reshape(3, -1), axes.reshape(-1, len(segment)))
     if (segment < 0).any():
-        fixed = (offset - np.asarray(robot.offset[0])) * (segment < 0)[:, None]
-        x = x + jnp.asarray(fixed.T, x.dtype)
+        fixed = (offset - base_point(robot)) * (segment < 0)[:, None]
+        x = x + fixed.T
     return Vec.of(x, 0), carrier
 
 
@@ -235,5 +236,5 @@ def select(motion: Motion, carrier: np.ndarray) -> Motion:
     return Motion.of(_dot(motion.stack(), carrier))
 
 
-def _dot(a: Array, b: Array) -> Array:
+def _dot(a: Array, b: Constant) -> Array:
     return jnp.matmul(a, jnp.asarray(b, a.dtype), precision="highest")

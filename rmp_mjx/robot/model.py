@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -10,15 +9,23 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from rmp_mjx.robot.control_points import (
     Capsules,
     ControlPoints,
     body_capsules,
-    touching_pairs,
     sample_control_points,
+    touching_pairs,
 )
+from rmp_mjx.robot.mjcf import (
+    RobotError,
+    compile_arm,
+    lock_other_joints,
+    read_spec,
+    unknown,
+)
+from rmp_mjx.types import Constant
 
 ARMATURE = {
     "physical": None,
@@ -30,10 +37,6 @@ SPACING = 0.0135
 """Default distance between control points [m]: about 64 of them on the Jaco 2."""
 
 
-class RobotError(ValueError):
-    """The MJCF, or a name given with it, cannot serve as a robot."""
-
-
 @struct.dataclass
 class Robot:
     """A fixed-base serial arm: constants of its kinematics, dynamics and geometry.
@@ -43,33 +46,33 @@ class Robot:
     one rotation about z (or shift along z) per joint.
     """
 
-    offset: Float[Array, "n 3"]
+    offset: Float[Constant, "n 3"]
     """Joint frame's origin in the previous joint's frame, at the reference pose [m]."""
-    rotation: Float[Array, "n 3 3"]
+    rotation: Float[Constant, "n 3 3"]
     """Joint frame's rotation in the previous joint's frame, at the reference pose."""
-    q_ref: Float[Array, " n"]
+    q_ref: Float[Constant, " n"]
     """Joint coordinates of the reference pose (MuJoCo's qpos0) [rad or m]."""
-    q_home: Float[Array, " n"]
+    q_home: Float[Constant, " n"]
     """Nominal posture: keyframe `home`, else q_ref."""
-    q_lower: Float[Array, " n"]
+    q_lower: Float[Constant, " n"]
     """Lower joint limits; -inf for an unlimited joint."""
-    q_upper: Float[Array, " n"]
+    q_upper: Float[Constant, " n"]
     """Upper joint limits; +inf for an unlimited joint."""
-    tau_max: Float[Array, " n"]
+    tau_max: Float[Constant, " n"]
     """Actuator limits [N m or N]."""
-    mass: Float[Array, " n"]
+    mass: Float[Constant, " n"]
     """Mass that moves rigidly with each joint [kg]."""
-    com: Float[Array, "n 3"]
+    com: Float[Constant, "n 3"]
     """Its centre, in the joint frame [m]."""
-    inertia: Float[Array, "n 3 3"]
+    inertia: Float[Constant, "n 3 3"]
     """Its rotational inertia about that centre, in the joint frame [kg m^2]."""
-    armature: Float[Array, " n"]
+    armature: Float[Constant, " n"]
     """Rotor inertia added to the diagonal of Mq [kg m^2 or kg]."""
-    gravity: Float[Array, " 3"]
+    gravity: Float[Constant, " 3"]
     """Gravity in the world frame [m/s^2]."""
-    site_offset: Float[Array, " 3"]
+    site_offset: Float[Constant, " 3"]
     """End-effector site in the last joint's frame [m]."""
-    site_rotation: Float[Array, "3 3"]
+    site_rotation: Float[Constant, "3 3"]
     """Its rotation there."""
     points: ControlPoints
     """Control points on the moving links."""
@@ -123,9 +126,9 @@ class Robot:
             RobotError: Unknown name or armature setting.
         """
         if name != "jaco2":
-            raise RobotError(_unknown("robot", name, ["jaco2"]))
+            raise RobotError(unknown("robot", name, ["jaco2"]))
         if armature not in ARMATURE:
-            raise RobotError(_unknown("armature setting", armature, list(ARMATURE)))
+            raise RobotError(unknown("armature setting", armature, list(ARMATURE)))
         path = resources.files("rmp_mjx.robot") / "jaco2" / "jaco2.xml"
         options = {"site": "grip", "armature": ARMATURE[armature]} | kwargs
         return Robot.from_mjcf(str(path), **options)
@@ -159,8 +162,8 @@ class Robot:
             RobotError: A name is unknown, the chain has a joint that is neither hinge
                 nor slide, or the actuators are not one limited motor per joint.
         """
-        spec = _read(path)
-        spec, joints = _lock_other_joints(spec, site, joints)
+        spec = read_spec(path)
+        spec, joints = lock_other_joints(spec, site, joints)
         if armature is not None:
             if len(armature) != len(joints):
                 raise RobotError(
@@ -168,7 +171,7 @@ class Robot:
                 )
             for name, value in zip(joints, armature, strict=True):
                 spec.joint(name).armature = value
-        model = spec.compile()
+        model, mjcf, home = compile_arm(spec)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -184,19 +187,13 @@ class Robot:
         limited = model.jnt_limited[ids].astype(bool)
         site_id = model.site(site).id
         R_last = frames_R[-1]
-        key = next(
-            (k for k in range(model.nkey) if model.key(k).name == "home"), None
-        )
-        q_home = model.qpos0 if key is None else model.key_qpos[key]
-        for k in list(spec.keys):  # q_home keeps what matters of them
-            spec.delete(k)
         prev_p = np.vstack([np.zeros(3), frames_p[:-1]])
         prev_R = np.concatenate([np.eye(3)[None], frames_R[:-1]])
         return Robot(
             offset=np.einsum("nji,nj->ni", prev_R, frames_p - prev_p),
             rotation=np.einsum("nji,njk->nik", prev_R, frames_R),
             q_ref=model.qpos0[model.jnt_qposadr[ids]].copy(),
-            q_home=np.array(q_home)[model.jnt_qposadr[ids]],
+            q_home=home[model.jnt_qposadr[ids]],
             q_lower=np.where(limited, model.jnt_range[ids, 0], -np.inf),
             q_upper=np.where(limited, model.jnt_range[ids, 1], np.inf),
             tau_max=_torque_limits(model, joints, torque_limits),
@@ -219,73 +216,8 @@ class Robot:
             joint_names=tuple(joints),
             site_name=site,
             body_names=tuple(dict.fromkeys(bodies)),
-            mjcf=spec.to_xml(),
+            mjcf=mjcf,
         )
-
-
-def _unknown(kind: str, name: str, valid: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, valid, n=1)
-    hint = f" Did you mean '{near[0]}'?" if near else ""
-    return f"unknown {kind} '{name}'; valid names: {', '.join(valid)}.{hint}"
-
-
-def _read(path: str | Path) -> mujoco.MjSpec:
-    text = str(path)
-    try:
-        if text.lstrip().startswith("<"):
-            return mujoco.MjSpec.from_string(text)
-        if not Path(text).is_file():
-            raise RobotError(f"no MJCF file at '{text}'")
-        return mujoco.MjSpec.from_file(text)
-    except ValueError as error:
-        if isinstance(error, RobotError):
-            raise
-        raise RobotError(f"MuJoCo cannot read the MJCF: {error}") from error
-
-
-def _lock_other_joints(
-    spec: mujoco.MjSpec, site: str, joints: Sequence[str] | None
-) -> tuple[mujoco.MjSpec, list[str]]:
-    """Remove every joint (and its actuators) that is not on the chain to the site."""
-    sites = {s.name: s for s in spec.sites}
-    if site not in sites:
-        raise RobotError(_unknown("site", site, sorted(sites)))
-    chain, body = [], sites[site].parent
-    while body is not None and body.name != "world":
-        chain = [*body.joints, *chain]
-        body = body.parent
-    for joint in chain:
-        if joint.type not in (
-            mujoco.mjtJoint.mjJNT_HINGE,
-            mujoco.mjtJoint.mjJNT_SLIDE,
-        ):
-            kind = mujoco.mjtJoint(joint.type).name
-            raise RobotError(f"joint '{joint.name}' is {kind}: use hinges and slides")
-    names = [joint.name for joint in chain]
-    if not names:
-        raise RobotError(f"no joint between the world and site '{site}'")
-    if joints is not None:
-        for name in joints:
-            if name not in names:
-                raise RobotError(_unknown(f"joint on the chain to '{site}'", name, names))
-        if list(joints) != names:
-            raise RobotError(
-                f"the chain to '{site}' has the joints {names}; got {list(joints)}: "
-                "give all of them, base first"
-            )
-    for actuator in list(spec.actuators):
-        if (
-            actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
-            and actuator.target not in names
-        ):
-            spec.delete(actuator)
-    for joint in list(spec.joints):
-        if joint.name not in names:
-            spec.delete(joint)
-    for key in list(spec.keys):
-        if len(key.qpos) != len(names):
-            spec.delete(key)
-    return spec, names
 
 
 def _frame_with_z(z: np.ndarray) -> np.ndarray:
@@ -337,7 +269,7 @@ def _carriers(
         return set(with_geoms)
     for link in links:
         if link not in names:
-            raise RobotError(_unknown("link with geoms", link, list(names)))
+            raise RobotError(unknown("link with geoms", link, list(names)))
     return {names[link] for link in links}
 
 

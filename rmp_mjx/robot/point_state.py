@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from rmp_mjx.rmp import RMP
 from rmp_mjx.robot.kinematics import (
@@ -64,7 +64,7 @@ class PointRMP:
 def point_state(robot: Robot, arm: ArmState) -> PointState:
     """Move the control points with the links."""
     x, carrier = carry_points(
-        robot, arm, np.asarray(robot.points.offset), np.array(robot.points.segment, int)
+        robot, arm, robot.points.offset, np.array(robot.points.segment, int)
     )
     V, A = select(arm.V, carrier), select(arm.A, carrier)
     v = V.at(x)
@@ -112,8 +112,12 @@ def pull_to_joints(
     momentum = Motion(
         Vec(Vec(xx, xy, xz) @ lin, Vec(xy, yy, yz) @ lin, Vec(xz, yz, zz) @ lin)
         + Vec(a @ ang, b @ ang, c @ ang),
-        a * lin.x + b * lin.y + c * lin.z
-        + Vec(Vec(txx, txy, txz) @ ang, Vec(txy, tyy, tyz) @ ang, Vec(txz, tyz, tzz) @ ang),
+        a * lin.x
+        + b * lin.y
+        + c * lin.z
+        + Vec(
+            Vec(txx, txy, txz) @ ang, Vec(txy, tyy, tyz) @ ang, Vec(txz, tyz, tzz) @ ang
+        ),
     )
     return RMP(f=joint_forces(arm.S, sums[:6]), M=joint_metric(arm.S, momentum))
 

@@ -55,7 +55,7 @@ class Contacts:
 
 
 class Physics(Protocol):
-    """One engine with one model. All methods are pure, single-environment, vmappable."""
+    """One engine with one model; all methods are pure, for one environment."""
 
     model: mujoco.MjModel
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -23,6 +25,7 @@ class MujocoPhysics:
         """Keep the model; batches are made when their size is first seen."""
         self.model = model
         self._batches: dict[int, mujoco.batch.Batch] = {}
+        self._lock = threading.Lock()  # JAX may run two programs at once
 
     def init(
         self, qpos: Array, qvel: Array, mocap_pos: Array | None = None
@@ -61,15 +64,13 @@ class MujocoPhysics:
         lead, dtype = qpos.shape[:-1], qpos.dtype
         batch = self._batch(int(np.prod(lead, dtype=int)))
         good = np.ones(batch.nsim, bool)
-        for x in (qpos, qvel, ctrl):
-            flat = x.reshape(batch.nsim, -1)
+        for x in (qpos, qvel, ctrl, mocap_pos):
+            flat = x.reshape(batch.nsim, x.size // batch.nsim)
             good &= np.all(np.abs(flat) < mujoco.mjMAXVAL, axis=1)
         mask = good[:, None]
         batch.qpos[:] = np.where(mask, qpos.reshape(batch.nsim, -1), self.model.qpos0)
         batch.qvel[:] = np.where(mask, qvel.reshape(batch.nsim, -1), 0.0)
-        batch.qacc_warmstart[:] = np.where(
-            mask, warmstart.reshape(batch.nsim, -1), 0.0
-        )
+        batch.qacc_warmstart[:] = np.where(mask, warmstart.reshape(batch.nsim, -1), 0.0)
         batch.ctrl[:] = np.where(mask, ctrl.reshape(batch.nsim, -1), 0.0)
         if self.model.nmocap:
             batch.mocap_pos[:] = mocap_pos.reshape(batch.nsim, -1, 3)
