@@ -151,7 +151,10 @@ def machine() -> dict[str, Any]:
     """Describe the machine and the software that a figure was measured with."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
-        versions[package] = metadata.version(package)
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed"
     return {
         "cpu": _cpu_name(),
         "cores": _usable_cores(),

@@ -24,7 +24,7 @@ class Policy(NamedTuple):
     """A policy with a memory."""
 
     start: Callable[[Array], Array]
-    """Its memory at the start of an episode, from a key."""
+    """Its memory (12,) at the start of an episode, from a key."""
     act: Callable[[Array, Array, Array], tuple[Array, Array]]
     """New memory and action, from memory, key and the vector to the target [m]."""
 
@@ -94,7 +94,7 @@ def straight(kp: float = 150.0) -> Policy:
 
     def start(key: Array) -> Array:
         del key
-        return jnp.zeros(0)
+        return jnp.zeros(ACTION_SIZE)
 
     def act(memory: Array, key: Array, to_target: Array) -> tuple[Array, Array]:
         del key
@@ -105,5 +105,9 @@ def straight(kp: float = 150.0) -> Policy:
     return Policy(start, act)
 
 
-RANDOM: dict[str, Callable[[], Policy]] = {"smooth": smooth, "hard": hard}
-"""The random policies by name."""
+POLICIES: dict[str, Callable[[], Policy]] = {
+    "smooth": smooth,
+    "hard": hard,
+    "straight": straight,
+}
+"""The policies by name, with their default parameters."""

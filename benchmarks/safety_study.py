@@ -1,9 +1,11 @@
-"""Drive many arms with a policy and record every step's safety and torques."""
+"""Drive many arms with fixed policies and record every step's safety and torques."""
 
 from __future__ import annotations
 
+import copy
 import functools
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from flax import struct
 from jax import Array
 
 import envs
-from benchmarks.policies import Policy
+from benchmarks.policies import POLICIES
 from envs.base import ArmEnv
 from envs.placement import place_spheres, sample_apart
 from envs.safety import SafetyRecord, observe
@@ -29,13 +31,32 @@ ENDING = ("collision", "self_collision", "joint_limit")
 
 LAYOUTS = ("box", "far", "close")
 """Where spheres may be: anywhere in the box but 3 cm clear of the arm, or as the
-trajectory task places them around its via points (here: around the target)."""
+trajectory task places them around its via points, the first of which is the target."""
+
+SPHERES, RADIUS = 2, 0.05
+REACH = 0.05
+"""A target counts as reached within this distance, as in the trajectory task [m]."""
 
 REVERSAL = 1.0
 """A torque that turns round by more than this both ways counts as a reversal [N m]."""
 
-NOWHERE = 1e3
-"""Distance of a target that constrains no sphere [m]."""
+PARTS = ("collision", "self_collision", "joint_limit", "posture", "regularizer")
+"""Parts of the controller that a study may replace without compiling again."""
+
+
+class Group(NamedTuple):
+    """Worlds of a batch that share a policy and a scene."""
+
+    policy: str
+    """A name in `POLICIES`."""
+    layout: str | None
+    """One of `LAYOUTS`; None for no spheres."""
+    worlds: int
+    """How many."""
+    limit: int
+    """Policy steps after which an episode ends."""
+    reaching: bool = False
+    """Whether an episode also ends when the target is reached."""
 
 
 @struct.dataclass
@@ -56,21 +77,131 @@ class World:
     """Policy steps since the reset."""
 
 
-def make_env(
-    controller: RMPVICES | VICES, physics: str, spheres: int, sim_dt: float
-) -> ArmEnv:
-    """The trajectory task's scene with a controller in it."""
-    return envs.load(
-        "trajectory",
-        controller=controller,
-        physics=physics,
-        robot=controller.robot,
-        obstacles=spheres,
-        sim_dt=sim_dt,
-    )
+@struct.dataclass
+class Rules:
+    """A group's rules as numbers, so that all groups run in one program."""
+
+    policy: Array
+    """Index into `POLICIES`."""
+    layout: Array
+    """Index into `LAYOUTS`; -1 for no spheres."""
+    limit: Array
+    """Time limit in policy steps."""
+    reaching: Array
+    """Whether reaching the target ends the episode."""
+
+    @staticmethod
+    def of(groups: Sequence[Group]) -> Rules:
+        """The rules of every world, group after group."""
+        count = [g.worlds for g in groups]
+        names = tuple(POLICIES)
+        layout = [-1 if g.layout is None else LAYOUTS.index(g.layout) for g in groups]
+        return Rules(
+            policy=jnp.repeat(
+                jnp.array([names.index(g.policy) for g in groups]), np.array(count)
+            ),
+            layout=jnp.repeat(jnp.array(layout), np.array(count)),
+            limit=jnp.repeat(jnp.array([g.limit for g in groups]), np.array(count)),
+            reaching=jnp.repeat(
+                jnp.array([g.reaching for g in groups]), np.array(count)
+            ),
+        )
 
 
-def reset(env: ArmEnv, policy: Policy, layout: str, key: Array) -> World:
+class Study:
+    """A compiled experiment: the same worlds, policies and seeds for any leaves."""
+
+    def __init__(
+        self,
+        controller: RMPVICES | VICES,
+        groups: Sequence[Group],
+        steps: int,
+        *,
+        physics: str = "mujoco",
+        sim_dt: float = 0.005,
+        terminate: bool = True,
+    ):
+        """Build the scene.
+
+        Args:
+            controller: Kind of controller; `run` may replace its `PARTS`.
+            groups: The worlds.
+            steps: Policy steps of each.
+            physics: Engine, `mujoco` or `mjx`.
+            sim_dt: Physics and control timestep [s].
+            terminate: Whether an event ends an episode; a non-finite state always does.
+        """
+        self.groups, self.steps, self.terminate = tuple(groups), steps, terminate
+        self.env = envs.load(
+            "trajectory",
+            controller=controller,
+            physics=physics,
+            robot=controller.robot,
+            obstacles=SPHERES,
+            sphere_radius=RADIUS,
+            sim_dt=sim_dt,
+        )
+        self._run = jax.jit(self._simulate)
+
+    def run(
+        self, controller: RMPVICES | VICES, seed: int
+    ) -> dict[Group, dict[str, np.ndarray]]:
+        """Every step's figures by group, (steps, worlds) each."""
+        parts = {}
+        if isinstance(controller, RMPVICES):
+            parts = {name: getattr(controller, name) for name in PARTS}
+        figures = jax.tree.map(np.asarray, self._run(parts, jax.random.key(seed)))
+        ends = np.cumsum([g.worlds for g in self.groups])[:-1]
+        split = {k: np.split(v, ends, axis=1) for k, v in figures.items()}
+        return {
+            group: {k: v[i] for k, v in split.items()}
+            for i, group in enumerate(self.groups)
+        }
+
+    def _simulate(self, parts: dict[str, Any], key: Array) -> dict[str, Array]:
+        env = copy.copy(self.env)
+        env.controller = env.controller.replace(**parts)
+        rules = Rules.of(self.groups)
+        count = rules.policy.shape[0]
+
+        def fresh(key: Array) -> World:
+            keys = jax.random.split(key, count)
+            return jax.vmap(functools.partial(reset, env))(keys, rules)
+
+        def one(worlds: World, key: Array) -> tuple[World, dict[str, Array]]:
+            key_step, key_reset = jax.random.split(key)
+            keys = jax.random.split(key_step, count)
+            advance = jax.vmap(functools.partial(step, env))
+            worlds, ended, figures = advance(worlds, keys, rules)
+            over = (worlds.age >= rules.limit) | (figures["nonfinite"] > 0)
+            over |= rules.reaching & (figures["error"] < REACH)
+            over |= ended & self.terminate
+            figures |= {"over": over, "age": worlds.age}
+            worlds = jax.lax.cond(
+                over.any(),
+                lambda w, key: _pick(over, fresh(key), w),
+                lambda w, _: w,
+                worlds,
+                key_reset,
+            )
+            return worlds, figures
+
+        key_start, key_run = jax.random.split(key)
+        return jax.lax.scan(
+            one, fresh(key_start), jax.random.split(key_run, self.steps)
+        )[1]
+
+
+def _pick(mask: Array, new: Any, old: Any) -> Any:
+    def pick(n: Array, o: Array) -> Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (o.ndim - 1)), n, o).astype(
+            o.dtype
+        )
+
+    return jax.tree.map(pick, new, old)
+
+
+def reset(env: ArmEnv, key: Array, rules: Rules) -> World:
     """A world near the home pose with new spheres and a new target."""
     key_q, key_target, key_spheres, key_policy = jax.random.split(key, 4)
     robot, n = env.robot, env.robot.n
@@ -80,23 +211,27 @@ def reset(env: ArmEnv, policy: Policy, layout: str, key: Array) -> World:
     segment = np.array(robot.points.segment)
     offset = jnp.asarray(robot.points.offset, p.dtype)
     arm = p[:, segment].T + jnp.einsum("ijk,kj->ki", R[:, :, segment], offset)
-    centers, placed = place_spheres(
-        key_spheres,
-        env.scene.spheres,
-        0.05,
-        "close" if layout == "box" else layout,
-        BOX_LOW,
-        BOX_HIGH,
-        targets + NOWHERE if layout == "box" else targets,
-        base_point(robot) + arm,
-        jnp.asarray(robot.points.radius),
+    arm, radii = base_point(robot) + arm, jnp.asarray(robot.points.radius)
+
+    def place(layout: str) -> tuple[Array, Array]:
+        task, nowhere = ("close", 1e3) if layout == "box" else (layout, 0.0)
+        return place_spheres(
+            key_spheres, SPHERES, RADIUS, task, BOX_LOW, BOX_HIGH,
+            targets + nowhere, arm, radii,
+        )  # fmt: skip
+
+    options = [place(layout) for layout in LAYOUTS]
+    centers, placed = (
+        jnp.stack(column)[rules.layout] for column in zip(*options, strict=True)
     )
+    placed &= rules.layout >= 0
     centers = jnp.where(placed[:, None], centers, jnp.array([0.0, 0.0, -5.0]))
+    memories = jnp.stack([make().start(key_policy) for make in POLICIES.values()])
     return World(
         data=env.physics.init(q, jnp.zeros(n), centers),
         placed=placed,
         target=targets[0],
-        memory=policy.start(key_policy),
+        memory=memories[rules.policy],
         going_on={name: jnp.zeros((), bool) for name in EVENTS},
         age=jnp.zeros((), jnp.int32),
     )
@@ -134,7 +269,7 @@ def drive(
 
 
 def step(
-    env: ArmEnv, policy: Policy, world: World, key: Array
+    env: ArmEnv, world: World, key: Array, rules: Rules
 ) -> tuple[World, Array, dict[str, Array]]:
     """One policy step.
 
@@ -143,7 +278,13 @@ def step(
     """
     n, ctrl = env.robot.n, env.controller
     before, _ = site_pose(env.robot, world.data.qpos[:n])
-    memory, action = policy.act(world.memory, key, world.target - before)
+    acts = [
+        make().act(world.memory, key, world.target - before)
+        for make in POLICIES.values()
+    ]
+    memory, action = (
+        jnp.stack(column)[rules.policy] for column in zip(*acts, strict=True)
+    )
     setpoint = ctrl.setpoint(world.data.qpos[:n], ctrl.decode(action))
     obstacles = env.obstacles(world.data, world.placed)
     data, record, figures = drive(env, world.data, setpoint, obstacles)
@@ -159,64 +300,10 @@ def step(
         "speed": jnp.linalg.norm(moved) / env.dt,
         "saturation": record.saturation,
         "force": record.force_peak,
-        "error": jnp.linalg.norm(world.target - after),
     }
     figures = {k: jnp.where(bad, 0.0, v) for k, v in figures.items()}
+    figures["error"] = jnp.linalg.norm(world.target - after)
     figures["nonfinite"] = bad.astype(jnp.float32)
     world = world.replace(data=data, memory=memory, going_on=now, age=world.age + 1)
     ended = functools.reduce(jnp.logical_or, (now[name] for name in ENDING))
-    return world, ended | bad, figures
-
-
-def record(
-    env: ArmEnv,
-    policy: Policy,
-    layout: str,
-    seed: int,
-    num_envs: int,
-    steps: int,
-    *,
-    terminate: bool = True,
-    episode_length: int = 1024,
-) -> dict[str, np.ndarray]:
-    """Every step's figures of a batch of worlds, (steps, num_envs) each.
-
-    Args:
-        env: Scene and controller.
-        policy: What moves the set-point.
-        layout: One of `LAYOUTS`.
-        seed: Of starts, spheres, targets and actions.
-        num_envs: Worlds side by side.
-        steps: Policy steps of each.
-        terminate: Whether an event ends an episode; a non-finite state always does.
-        episode_length: Policy steps until the time limit, which starts a new one.
-    """
-    new = jax.vmap(functools.partial(reset, env, policy, layout))
-    advance = jax.vmap(functools.partial(step, env, policy))
-
-    def one(worlds: World, key: Array) -> tuple[World, dict[str, Array]]:
-        key_step, key_reset = jax.random.split(key)
-        worlds, ended, figures = advance(worlds, jax.random.split(key_step, num_envs))
-        over = worlds.age >= episode_length
-        over |= ended if terminate else figures["nonfinite"] > 0
-        fresh = functools.partial(_refresh, new, over)
-        worlds = jax.lax.cond(over.any(), fresh, lambda w, _: w, worlds, key_reset)
-        return worlds, figures
-
-    @jax.jit
-    def run(key: Array) -> dict[str, Array]:
-        key_start, key_run = jax.random.split(key)
-        worlds = new(jax.random.split(key_start, num_envs))
-        return jax.lax.scan(one, worlds, jax.random.split(key_run, steps))[1]
-
-    return jax.tree.map(np.asarray, run(jax.random.key(seed)))
-
-
-def _refresh(new: Any, over: Array, worlds: World, key: Array) -> World:
-    """Reset the worlds whose episode is over."""
-
-    def pick(fresh: Array, old: Array) -> Array:
-        mask = over.reshape(over.shape + (1,) * (old.ndim - 1))
-        return jnp.where(mask, fresh.astype(old.dtype), old)
-
-    return jax.tree.map(pick, new(jax.random.split(key, over.shape[0])), worlds)
+    return world, ended, figures

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
 
 class RobotError(ValueError):
@@ -22,28 +22,38 @@ def unknown(kind: str, name: str, valid: Sequence[str]) -> str:
 
 
 def read_spec(path: str | Path) -> mujoco.MjSpec:
-    """Parse an MJCF file, or MJCF text."""
+    """Parse an MJCF file, or MJCF text; every body, joint and geom gets a name."""
     text = str(path)
     try:
         if text.lstrip().startswith("<"):
-            return mujoco.MjSpec.from_string(text)
-        if not Path(text).is_file():
+            spec = mujoco.MjSpec.from_string(text)
+        elif not Path(text).is_file():
             raise RobotError(f"no MJCF file at '{text}'")
-        spec = mujoco.MjSpec.from_file(text)
-        folder = Path(text).resolve().parent  # so that the arm's text finds its assets
-        spec.compiler.meshdir = str(folder / spec.compiler.meshdir)
-        spec.compiler.texturedir = str(folder / spec.compiler.texturedir)
-        return spec
+        else:
+            spec = mujoco.MjSpec.from_file(text)
+            folder = Path(text).resolve().parent  # the arm's text must find its assets
+            spec.compiler.meshdir = str(folder / spec.compiler.meshdir)
+            spec.compiler.texturedir = str(folder / spec.compiler.texturedir)
     except ValueError as error:
         if isinstance(error, RobotError):
             raise
         raise RobotError(f"MuJoCo cannot read the MJCF: {error}") from error
+    for kind in ("body", "joint", "geom"):
+        parts = {"body": spec.bodies, "joint": spec.joints, "geom": spec.geoms}[kind]
+        taken = {part.name for part in parts}
+        free = (f"{kind}_{k}" for k in itertools.count() if f"{kind}_{k}" not in taken)
+        for part in parts:
+            part.name = part.name or next(free)
+    return spec
 
 
 def lock_other_joints(
     spec: mujoco.MjSpec, site: str, joints: Sequence[str] | None
 ) -> tuple[mujoco.MjSpec, list[str]]:
-    """Remove every joint (and its actuators) that is not on the chain to the site."""
+    """Remove every joint (and its actuators) that is not on the chain to the site.
+
+    Tendons, equalities and sensors go with them: the arm is a chain and its motors.
+    """
     sites = {s.name: s for s in spec.sites}
     if site not in sites:
         raise RobotError(unknown("site", site, sorted(sites)))
@@ -73,39 +83,48 @@ def lock_other_joints(
                 "give all of them, base first"
             )
     for actuator in list(spec.actuators):
-        if (
-            actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
-            and actuator.target not in names
-        ):
+        on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
+        if not on_joint or actuator.target not in names:
             spec.delete(actuator)
+    for part in (*spec.sensors, *spec.equalities, *spec.tendons):
+        spec.delete(part)  # grippers have them, and they may name a joint that goes
     for joint in list(spec.joints):
         if joint.name not in names:
             spec.delete(joint)
-    for key in list(spec.keys):
-        if len(key.qpos) != len(names):
-            spec.delete(key)
     return spec, names
 
 
-def compile_arm(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, str, np.ndarray]:
-    """The compiled arm, its MJCF text and its home configuration (nq,).
-
-    MuJoCo writes numbers with six digits, so the model is compiled from the text: they
-    are the same arm to the last bit.
-    """
-    try:
-        home = _home(spec.compile())
-    except ValueError as error:
-        raise RobotError(f"MuJoCo cannot compile the MJCF: {error}") from error
-    for key in list(spec.keys):  # home is all that matters of them
-        spec.delete(key)
-    text = spec.to_xml()
-    return mujoco.MjModel.from_xml_string(text), text, home
-
-
-def _home(model: mujoco.MjModel) -> np.ndarray:
-    """Keyframe `home`, else the reference configuration."""
+def home_configuration(
+    spec: mujoco.MjSpec,
+) -> dict[str, float]:
+    """Each joint's coordinate in keyframe `home`, else at the reference pose."""
+    model = compile_spec(spec)
+    qpos = model.qpos0
     for k in range(model.nkey):
         if model.key(k).name == "home":
-            return model.key_qpos[k].copy()
-    return model.qpos0.copy()
+            qpos = model.key_qpos[k]
+    return {
+        model.joint(j).name: float(qpos[model.jnt_qposadr[j]])
+        for j in range(model.njnt)
+    }
+
+
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile, with MuJoCo's complaint as a `RobotError`."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise RobotError(f"MuJoCo cannot compile the MJCF: {error}") from error
+
+
+def compile_text(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, str]:
+    """The arm as MJCF text, and the model compiled from this very text.
+
+    MuJoCo writes numbers with six digits: compiled from the text, both are the same
+    arm. Keyframes are left out.
+    """
+    for key in list(spec.keys):
+        spec.delete(key)
+    compile_spec(spec)
+    text = spec.to_xml()
+    return mujoco.MjModel.from_xml_string(text), text

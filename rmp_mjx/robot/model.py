@@ -20,7 +20,8 @@ from rmp_mjx.robot.control_points import (
 )
 from rmp_mjx.robot.mjcf import (
     RobotError,
-    compile_arm,
+    compile_text,
+    home_configuration,
     lock_other_joints,
     read_spec,
     unknown,
@@ -163,6 +164,7 @@ class Robot:
                 nor slide, or the actuators are not one limited motor per joint.
         """
         spec = read_spec(path)
+        home = home_configuration(spec)
         spec, joints = lock_other_joints(spec, site, joints)
         if armature is not None:
             if len(armature) != len(joints):
@@ -171,7 +173,7 @@ class Robot:
                 )
             for name, value in zip(joints, armature, strict=True):
                 spec.joint(name).armature = value
-        model, mjcf, home = compile_arm(spec)
+        model, mjcf = compile_text(spec)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -193,7 +195,7 @@ class Robot:
             offset=np.einsum("nji,nj->ni", prev_R, frames_p - prev_p),
             rotation=np.einsum("nji,njk->nik", prev_R, frames_R),
             q_ref=model.qpos0[model.jnt_qposadr[ids]].copy(),
-            q_home=home[model.jnt_qposadr[ids]],
+            q_home=np.array([home[name] for name in joints]),
             q_lower=np.where(limited, model.jnt_range[ids, 0], -np.inf),
             q_upper=np.where(limited, model.jnt_range[ids, 1], np.inf),
             tau_max=_torque_limits(model, joints, torque_limits),

@@ -11,8 +11,13 @@ from rmp_mjx.sim.base import PhysicsError as PhysicsError
 from rmp_mjx.sim.base import PhysicsState as PhysicsState
 from rmp_mjx.sim.base import read_contacts as read_contacts
 from rmp_mjx.sim.base import watch_pairs as watch_pairs
+from rmp_mjx.sim.mjx import MjxPhysics
+from rmp_mjx.sim.mujoco_c import MujocoPhysics
 
-NAMES = ("auto", "mujoco", "mjx")
+ENGINES = {"mujoco": MujocoPhysics, "mjx": MjxPhysics}
+"""Engines by name."""
+
+NAMES = ("auto", *ENGINES)
 """What `load_physics` accepts: `auto` is `mujoco` on a CPU and `mjx` elsewhere."""
 
 
@@ -26,10 +31,4 @@ def load_physics(name: str, model: mujoco.MjModel) -> Physics:
         raise PhysicsError(f"unknown physics '{name}'; valid names: {', '.join(NAMES)}")
     if name == "auto":
         name = "mujoco" if jax.default_backend() == "cpu" else "mjx"
-    if name == "mujoco":
-        from rmp_mjx.sim.mujoco_c import MujocoPhysics
-
-        return MujocoPhysics(model)
-    from rmp_mjx.sim.mjx import MjxPhysics
-
-    return MjxPhysics(model)
+    return ENGINES[name](model)

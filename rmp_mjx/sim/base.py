@@ -109,14 +109,42 @@ def watch_pairs(spec: mujoco.MjSpec, pairs: list[tuple[str, str]], condim: int) 
 
 def read_contacts(model: mujoco.MjModel, state: PhysicsState) -> Contacts:
     """Contacts of the watched pairs, in the order given to `watch_pairs`."""
-    ids = [
-        s for s in range(model.nsensor) if model.sensor(s).name.startswith(PAIR_SENSOR)
-    ]
-    width = _WIDTH * CONTACTS_PER_PAIR
-    address = model.sensor_adr[ids][:, None] + np.arange(width)
-    rows = state.sensors[address.reshape(-1)].reshape(-1, CONTACTS_PER_PAIR, _WIDTH)
+    rows = state.sensors[_address(model).reshape(-1)]
+    rows = rows.reshape(-1, CONTACTS_PER_PAIR, _WIDTH)
     touching = (rows[..., 0] > 0) & (rows[..., 4] < 0)
     return Contacts(
         touching=jnp.any(touching, axis=1),
         force=jnp.sum(jnp.where(touching, rows[..., 1], 0.0), axis=1),
     )
+
+
+def sensor_rows(
+    model: mujoco.MjModel,
+    found: Float[Array, " pairs"],
+    force: Float[Array, " pairs"],
+    dist: Float[Array, " pairs"],
+) -> Float[Array, " s"]:
+    """Sensor data with each pair's contact in its first slot; other sensors are 0.
+
+    Args:
+        model: Scene made with `watch_pairs`.
+        found: Number of contacts of each pair.
+        force: Sum of their normal forces [N].
+        dist: Signed distance [m].
+    """
+    zero = jnp.zeros_like(force)
+    slot = jnp.stack([found.astype(force.dtype), force, zero, zero, dist], axis=-1)
+    sensors = jnp.zeros(model.nsensordata, force.dtype)
+    return sensors.at[_address(model)[:, :_WIDTH]].set(slot)
+
+
+def pair_sensors(model: mujoco.MjModel) -> list[int]:
+    """Ids of the sensors that `watch_pairs` made, in order."""
+    names = (model.sensor(s).name for s in range(model.nsensor))
+    return [s for s, name in enumerate(names) if name.startswith(PAIR_SENSOR)]
+
+
+def _address(model: mujoco.MjModel) -> np.ndarray:
+    """Where each pair's numbers are in the sensor data, (pairs, slots * width)."""
+    adr = model.sensor_adr[pair_sensors(model)]
+    return adr[:, None] + np.arange(_WIDTH * CONTACTS_PER_PAIR)

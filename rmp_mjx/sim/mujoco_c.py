@@ -61,6 +61,10 @@ class MujocoPhysics:
         qpos, qvel, warmstart, mocap_pos, ctrl = map(
             np.asarray, (qpos, qvel, warmstart, mocap_pos, ctrl)
         )
+        with self._lock:
+            return self._step_batch(qpos, qvel, warmstart, mocap_pos, ctrl)
+
+    def _step_batch(self, qpos, qvel, warmstart, mocap_pos, ctrl):
         lead, dtype = qpos.shape[:-1], qpos.dtype
         batch = self._batch(int(np.prod(lead, dtype=int)))
         good = np.ones(batch.nsim, bool)

@@ -22,6 +22,7 @@ SHOWN = (
     ("time/steps_per_s", "steps/s", ".0f"),
     ("episode/return", "return", ".1f"),
     ("episode/via_points", "via", ".2f"),
+    ("per_1000_steps/via_points", "via/1k", ".1f"),
     ("episode/success", "success", ".0%"),
     ("per_1000_steps/collision", "coll/1k", ".2f"),
     ("per_1000_steps/joint_limit", "limit/1k", ".2f"),

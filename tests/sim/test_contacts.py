@@ -13,7 +13,7 @@ ROD, TARGET, BALL = range(3)  # the order of the pairs in conftest.py
 
 @pytest.fixture(scope="module", params=["mujoco", "mjx"])
 def settled(request, weights):
-    """Half a second under constant forces: free, pressed down, lifted, pushed up."""
+    """0.8 s under constant forces: none, pressing, lifting, against the target."""
     engine = load_physics(request.param, weights)
     force = jnp.array([[0.0, 0.0], [5.0, 7.0], [30.0, 40.0], [50.0, 0.0]])
     target = jnp.full((4, 1, 3), jnp.array([0.0, 0.0, 5.0]))
@@ -32,13 +32,13 @@ def settled(request, weights):
 
 
 def test_resting_force_is_the_weight_in_the_order_of_the_pairs(settled):
-    """Within 0.1 %: what is left of the settling motion after 0.8 s."""
+    """Within 0.3 %: what is left of the settling motion after 0.8 s, in float32."""
     force = np.asarray(settled[0].force)
     expected = np.zeros((4, 3))
     expected[0, [ROD, BALL]] = 3 * G, 2 * G
     expected[1, [ROD, BALL]] = 3 * G + 7, 2 * G + 5
     expected[3, [ROD, TARGET]] = 3 * G, 50 - 2 * G
-    np.testing.assert_allclose(force, expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(force, expected, rtol=3e-3, atol=1e-3)
 
 
 def test_touching_pairs_are_those_that_carry_force(settled):
@@ -53,7 +53,6 @@ def test_what_is_lifted_off_touches_nothing(settled):
 
 
 def test_pairs_that_are_not_watched_do_not_collide(weights):
-    """The rod is put on the target: no such pair, so it falls to the floor."""
     assert weights.npair == 3
     assert not weights.geom_contype.any() and not weights.geom_conaffinity.any()
 

@@ -1,5 +1,7 @@
 """MJX against MuJoCo C: free motion, and the force of scripted collisions."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,4 +119,9 @@ def test_the_state_keeps_its_types(jaco, mjx_step):
 
 
 def read_all(model, state):
-    return jax.vmap(lambda s: read_contacts(model, s))(state)
+    return _read(model)(state)
+
+
+@functools.cache
+def _read(model):
+    return jax.jit(jax.vmap(lambda s: read_contacts(model, s)))

@@ -162,19 +162,23 @@ def test_contact_sensors_are_the_contact_forces_of_mujoco(
     of the forces themselves.
     """
     model = jaco.scene.model
-    pairs = [p.split("/") for p in _pair_names(model)]
+    pairs = [
+        [model.geom(model.sensor_objid[i]).name, model.geom(model.sensor_refid[i]).name]
+        for i in range(model.nsensor)
+    ]
     state = start(engine, jaco, np.float32)
     loops = [
         reference(model, q, mocap, np.float32)
         for q, mocap in zip(jaco.q, jaco.mocap, strict=True)
     ]
+    read = jax.jit(jax.vmap(lambda s: read_contacts(model, s)))
     touched = set()
     for k in range(STEPS):
         state = step(state, jnp.asarray(jaco.torque(k), jnp.float32))
-        contacts = jax.vmap(lambda s: read_contacts(model, s))(state)
+        contacts = read(state)
         for lane, loop in enumerate(loops):
             loop.step(jaco.torque(k)[lane])
-            forces = [loop.force(*_geoms(pair)) for pair in pairs]
+            forces = [loop.force(*pair) for pair in pairs]
             np.testing.assert_allclose(
                 contacts.force[lane], forces, rtol=1e-6, atol=1e-6
             )
@@ -193,17 +197,6 @@ def test_contact_sensors_are_the_contact_forces_of_mujoco(
     assert (1, "arm/fingers", "table") in touched
     assert (2, "arm/fingers", "sphere_0") in touched
     assert [t for t in touched if t[0] == 3 and "table" not in t]
-
-
-def _pair_names(model):
-    names = [model.sensor(i).name for i in range(model.nsensor)]
-    return [n.removeprefix("touch/") for n in names if n.startswith("touch/")]
-
-
-def _geoms(parts):
-    """Undo 'arm/hand/table' and 'arm/hand/arm/base' (already split at the slashes)."""
-    a, b = parts[:2], parts[2:]
-    return "/".join(a), "/".join(b)
 
 
 def test_an_unknown_engine_is_refused_with_the_valid_names(weights):

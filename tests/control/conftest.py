@@ -1,0 +1,108 @@
+"""One compiled controller in float64 and one in float32, shared by all tests here."""
+
+import jax
+import numpy as np
+import pytest
+
+from rmp_mjx import RMPVICES, VICES, Obstacles
+
+BATCH = 500
+"""States per call; every test uses this shape, so each program compiles once."""
+
+
+@jax.jit
+def _controlled(ctrl, q, qd, action, obstacles):
+    def one(q, qd, action, obstacles):
+        setpoint = ctrl.setpoint(q, ctrl.decode(action))
+        return ctrl(q, qd, setpoint, obstacles)
+
+    return jax.vmap(one)(q, qd, action, obstacles)
+
+
+@pytest.fixture(scope="session")
+def run64():
+    """`run64(ctrl, q, qd, action, obstacles)`: outputs for BATCH states, float64."""
+
+    def run(*args):
+        with jax.enable_x64(True):
+            return jax.device_get(_controlled(*args))
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def run32():
+    """The same in float32."""
+
+    def run(*args):
+        single = jax.tree.map(_single, args)
+        return jax.device_get(_controlled(*single))
+
+    return run
+
+
+def _single(x):
+    x = np.asarray(x)
+    return x.astype(np.float32) if x.dtype == np.float64 else x
+
+
+@pytest.fixture(scope="session")
+def ctrl(robot):
+    return RMPVICES(robot)
+
+
+@pytest.fixture(scope="session")
+def vices(robot):
+    return VICES(robot)
+
+
+@pytest.fixture(scope="session")
+def states(robot):
+    """`states(seed)`: q, qd, action (BATCH, ...) from home outwards to the limits."""
+
+    def draw(seed=0, reach=1.0, speed=1.0):
+        rng = np.random.default_rng(seed)
+        q = robot.q_home + rng.uniform(-reach, reach, (BATCH, 7))
+        qd = rng.normal(scale=speed, size=(BATCH, 7))
+        return q, qd, rng.uniform(-1, 1, (BATCH, 12))
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def obstacles():
+    """`obstacles(seed)`: every kind, moving and turning, placed about the arm.
+
+    Other obstacles for each of the BATCH states; one sphere slot stays unused.
+    """
+
+    def draw(seed=0, scale=0.4, speed=1.0):
+        rng = np.random.default_rng(seed + 1000)
+
+        def some(k, s=1.0):
+            return rng.normal(scale=s, size=(BATCH, k, 3))
+
+        def fill(sphere, sphere_v, floor_v, ends, capsule_v, box, box_v):
+            slots = Obstacles.empty(spheres=3, planes=1, capsules=1, boxes=1)
+            up = np.array([[0.0, 0.0, 1.0]])
+            return (
+                slots.with_spheres(sphere, np.array([0.05, 0.1]), sphere_v)
+                .with_planes(-0.1 * up, up, floor_v)
+                .with_capsules(ends[:1], ends[1:], 0.05, *capsule_v)
+                .with_boxes(box, [[0.1, 0.2, 0.05]], None, 0.02, *box_v)
+            )
+
+        about = np.array([0.2, 0.0, 0.3])
+        with jax.enable_x64(True):
+            filled = jax.vmap(fill)(
+                about + some(2, scale),
+                some(2, speed),
+                some(1, 0.1 * speed),
+                about + some(2, scale),
+                some(2, speed)[:, :, None],
+                about + some(1, scale),
+                some(2, speed)[:, :, None],
+            )
+            return jax.device_get(filled)
+
+    return draw

@@ -1,0 +1,126 @@
+"""The fast evaluation against the tree that defines it, in float64."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rmp_mjx import RMPVICES, Node, Siblings
+from rmp_mjx.control.tree import rmp_vices_tree
+
+
+@pytest.fixture(scope="module")
+def inputs(states, obstacles):
+    return *states(0), obstacles(0)
+
+
+@pytest.fixture(scope="module")
+def fast(run64, ctrl, inputs):
+    return run64(ctrl, *inputs)
+
+
+def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, fast):
+    """500 states, all kinds of obstacles moving and turning, in contact or near.
+
+    1e-9 of the largest entry: rounding of metrics that span 1e6. The acceleration gets
+    the root's condition on top: 1e-7 of its largest entry.
+    """
+    slow = run64(RMPVICES(robot, jacobian="autodiff"), *inputs)
+    assert np.quantile(fast.diagnostics["clearance"], [0.1, 0.9]).tolist() < [0.0, 0.2]
+    for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("qdd", 1e-7), ("tau", 1e-7)):
+        a, b = (getattr(out, name).reshape(len(inputs[0]), -1) for out in (fast, slow))
+        scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
+        assert np.max(np.abs(a - b) / scale) < tolerance, name
+
+
+def _coordinates(node, x, t):
+    """All leaves below a node with their coordinates, siblings stacked: values only."""
+    if isinstance(node, Siblings):
+        axes = jax.tree.map(lambda a: 0 if jnp.ndim(a) else None, node.child)
+        return jax.vmap(_coordinates, in_axes=(axes, None, None))(node.child, x, t)
+    if isinstance(node, Node):
+        y = node.psi.at_time(x, t)
+        return [found for child in node.children for found in _coordinates(child, y, t)]
+    return [(node, x)]
+
+
+def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast):
+    """min sum |J_i qdd + c_i - a_i|^2_{M_i} + eps |qdd|^2_{Mq} by numpy's lstsq.
+
+    One Jacobian of all leaf coordinates stacked, no message passing. 1e-7 relative:
+    row weights span six orders.
+    """
+    eps = 0.02
+
+    @jax.jit
+    def leaf_terms(q, qd, action, obstacles, Mq):
+        setpoint = ctrl.setpoint(q, ctrl.decode(action))
+        tree = rmp_vices_tree(ctrl, setpoint, obstacles, Mq)
+
+        def values(q, t):
+            return [y for _, y in _coordinates(tree, q, t)]
+
+        def rates(s):
+            return jax.jvp(lambda s: values(q + s * qd, s), (s,), (1.0,))
+
+        (y, yd), (_, ydd) = jax.jvp(rates, (0.0,), (1.0,))
+        J = jax.jacfwd(values)(q, 0.0)
+        terms = []
+        for (leaf, x), xd, c, j in zip(
+            _coordinates(tree, q, 0.0), yd, ydd, J, strict=True
+        ):
+            evaluate = type(leaf).__call__
+            for _ in range(x.ndim - 1):
+                axes = jax.tree.map(lambda a: 0 if jnp.ndim(a) else None, leaf)
+                evaluate = jax.vmap(evaluate, in_axes=(axes, 0, 0))
+            terms.append((j, c, evaluate(leaf, x, xd)))
+        del y
+        return terms
+
+    @jax.jit
+    def inertia(q, qd):
+        from rmp_mjx.robot.dynamics import dynamics
+        from rmp_mjx.robot.kinematics import arm_state
+
+        return dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))[0]
+
+    eps = ctrl.regularizer
+    for k in range(10):
+        q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
+        with jax.enable_x64(True):
+            Mq = jax.device_get(inertia(q, qd))
+            terms = jax.device_get(leaf_terms(q, qd, action, obstacles, Mq))
+        rows, rhs = [np.sqrt(eps) * np.linalg.cholesky(Mq).T], [np.zeros(7)]
+        for J, c, rmp in terms:
+            m = c.shape[-1]
+            for j, curve, f, M in zip(
+                J.reshape(-1, m, 7),
+                c.reshape(-1, m),
+                rmp.f.reshape(-1, m),
+                rmp.M.reshape(-1, m, m),
+                strict=True,
+            ):
+                values, vectors = np.linalg.eigh(M)
+                keep = values > 1e-12 * max(values.max(), 1e-30)
+                root = np.sqrt(values[keep])[:, None] * vectors[:, keep].T
+                wanted = vectors[:, keep].T @ f / np.sqrt(values[keep])
+                rows.append(root @ j)
+                rhs.append(wanted - root @ curve)
+        expected = np.linalg.lstsq(np.concatenate(rows), np.concatenate(rhs))[0]
+        np.testing.assert_allclose(
+            fast.qdd[k], expected, rtol=0.0, atol=1e-7 * np.abs(expected).max()
+        )
+
+
+def test_every_branch_matters(run64, ctrl, inputs, fast):
+    """Weakening any leaf changes the torque: none is dead in the comparison above."""
+    for field, change in (
+        ("collision", {"mu": 1e-9}),
+        ("self_collision", {"mu": 1.0}),
+        ("posture", {"kq": 1.0}),
+    ):
+        leaf = dataclasses.replace(getattr(ctrl, field), **change)
+        out = run64(ctrl.replace(**{field: leaf}), *inputs)
+        assert np.abs(out.M - fast.M).max() + np.abs(out.f - fast.f).max() > 1e-6, field

@@ -1,0 +1,125 @@
+"""Control points and link capsules against MuJoCo's geoms."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from rmp_mjx import Robot
+from tests.robot.test_model import GRIPPER, ODD
+
+
+def _in_world(model, data, robot):
+    """Centre and radius of every control point at data's configuration."""
+    for body, offset, radius in robot.control_points:
+        b = model.body(body).id
+        yield data.xpos[b] + data.xmat[b].reshape(3, 3) @ offset, radius
+
+
+def test_points_lie_inside_their_capsules(robot):
+    """Each sphere is a ball of the geom: same radius, centre on the axis."""
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.random.default_rng(0).uniform(-3, 3, 7)
+    mujoco.mj_kinematics(model, data)
+    for (body, _, radius), (x, _) in zip(
+        robot.control_points, _in_world(model, data, robot), strict=True
+    ):
+        depths = []
+        for g in np.flatnonzero(model.geom_bodyid == model.body(body).id):
+            local = data.geom_xmat[g].reshape(3, 3).T @ (x - data.geom_xpos[g])
+            capsule = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE
+            half = model.geom_size[g, 1] if capsule else 0.0
+            local[2] -= np.clip(local[2], -half, half)
+            depths.append(model.geom_size[g, 0] - np.linalg.norm(local) - radius)
+        # 1e-6 m: rounding of six digits in the file's rotations.
+        assert max(depths) > -1e-6
+
+
+def test_about_64_points_cover_every_moving_link(robot):
+    assert 56 <= len(robot.control_points) <= 72
+    links = {f"link_{i}" for i in range(1, 8)}
+    assert links | {"fingers"} == set(robot.points.body)
+    assert set(robot.points.segment) == set(range(7))
+
+
+def test_no_gap_between_neighbours_is_wider_than_the_spacing(robot):
+    """Along each capsule, ends included: so their union covers it."""
+    for c, k in enumerate(robot.capsules.segment):
+        if k < 0:
+            continue
+        start, end = robot.capsules.start[c], robot.capsules.end[c]
+        offsets = robot.points.offset[np.array(robot.points.segment) == k]
+        along = end - start
+        length = np.linalg.norm(along)
+        if length < 1e-9:
+            continue
+        s = (offsets - start) @ along / length
+        off_axis = np.linalg.norm(offsets - start - s[:, None] * along / length, axis=1)
+        s = np.sort(s[(off_axis < 1e-9) & (s > -1e-9) & (s < length + 1e-9)])
+        np.testing.assert_allclose([s[0], s[-1]], [0.0, length], atol=1e-9)
+        assert np.diff(s).max() <= 0.0135 + 1e-9
+
+
+def test_sampling_is_deterministic_and_denser_with_smaller_spacing(robot):
+    again, dense = Robot.load(), Robot.load(spacing=0.005)
+    np.testing.assert_array_equal(again.points.offset, robot.points.offset)
+    assert again.capsules.pairs == robot.capsules.pairs
+    assert len(dense.control_points) > 2 * len(robot.control_points)
+    # Ends stay: a denser sampling never uncovers what a sparser one covered.
+    for radius in np.unique(robot.points.radius):
+        assert radius in dense.points.radius
+
+
+@pytest.mark.parametrize("text", [ODD, GRIPPER], ids=["odd", "gripper"])
+def test_capsules_enclose_geoms_of_any_shape(text):
+    """No corner of a geom's bounding box (nor the geom) sticks out of its capsule."""
+    robot = Robot.from_mjcf(text, site="tip")
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    moving = [c for c, k in enumerate(robot.capsules.segment) if k >= 0]
+    assert len(moving) == len(robot.capsules.geom) - sum(
+        k < 0 for k in robot.capsules.segment
+    )
+    for c in moving:
+        g = model.geom(robot.capsules.geom[c]).id
+        body = model.body(int(model.geom_bodyid[g])).name
+        balls = [
+            ball
+            for ball, name in zip(
+                _in_world(model, data, robot), robot.points.body, strict=True
+            )
+            if name == body
+        ]
+        for corner in _surface(model, data, g):
+            gaps = [np.linalg.norm(corner - x) - radius for x, radius in balls]
+            # Between two balls of a row the surface dips by spacing^2 / (8 radius).
+            assert min(gaps) < 1e-6 + 0.0135**2 / (8 * robot.capsules.radius[c])
+
+
+def _surface(model, data, g):
+    """Points on the hull of a geom: corners of a box, rims and poles of round ones."""
+    size, kind = model.geom_size[g], model.geom_type[g]
+    signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+    ring = np.array([[np.cos(t), np.sin(t)] for t in np.arange(0, 6.3, 0.3)])
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        local = signs * size
+    elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        local = np.concatenate([np.eye(3), -np.eye(3)]) * size[0]
+    else:  # the rims of a cylinder or a capsule
+        local = np.concatenate(
+            [
+                np.column_stack([ring * size[0], np.full(len(ring), h)])
+                for h in (-size[1], size[1])
+            ]
+        )
+    return data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T
+
+
+def test_watched_pairs_are_links_that_can_touch(robot):
+    """At least three joints apart; the hand can reach the base and the upper arm."""
+    names = robot.capsules.geom
+    pairs = {(names[far], names[near]) for far, near in robot.capsules.pairs}
+    assert ("hand", "base") in pairs and ("fingers", "link_1") in pairs
+    for far, near in robot.capsules.pairs:
+        assert robot.capsules.segment[far] - robot.capsules.segment[near] >= 3

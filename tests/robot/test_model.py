@@ -1,0 +1,155 @@
+"""Robots from small MJCFs that each stress the reader, against MuJoCo C in float64."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from rmp_mjx import Robot
+from tests import oracles
+
+MOTORS = """<motor joint="a" ctrlrange="-9 9"/><motor joint="b" ctrlrange="-8 8"/>
+<motor joint="c" gear="2" ctrlrange="-3 3"/>"""
+
+ODD = f"""<mujoco><option gravity="1 -2 -9"/><worldbody>
+<body pos=".1 .2 .3" euler="20 -30 40">
+  <joint name="a" type="slide" axis="1 2 2" pos=".1 0 0" armature=".3" ref=".2"/>
+  <geom type="box" size=".05 .1 .2" pos="0 .1 .2" euler="0 30 0" mass="2"/>
+  <body pos="0 .1 .4" euler="90 0 10">
+    <inertial pos=".01 .02 .1" mass="1.5" diaginertia=".03 .02 .01" euler="0 20 0"/>
+    <joint name="b" axis="0 1 1" pos="0 .02 -.1" ref="30"
+      range="-100 80"/>
+    <joint name="c" axis="1 0 -.5" pos=".05 0 0"/>
+    <geom type="cylinder" size=".04 .2" pos="0 0 .2"/>
+    <body pos="0 0 .4" euler="0 0 50"><geom size=".06" mass=".4"/>
+      <site name="tip" pos=".01 .02 .1" euler="15 25 35"/></body>
+  </body>
+</body></worldbody><actuator>{MOTORS}</actuator></mujoco>"""
+"""A rotated base without names, a slide, two joints on one body, offset axes, non-zero
+references, a fixed body beyond, tilted gravity, no keyframe, no capsule."""
+
+GRIPPER = f"""<mujoco><compiler angle="radian"/><worldbody><body name="base">
+<geom name="foot" type="box" size=".1 .1 .02"/>
+<body name="one" pos="0 0 .1"><joint name="a" axis="0 0 1"/>
+  <geom name="one" type="capsule" fromto="0 0 0 0 0 .3" size=".04"/>
+  <body name="two" pos="0 0 .3"><joint name="b" axis="0 1 0" range="-2 2"/>
+    <geom name="two" type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+    <body name="hand" pos=".3 0 0"><joint name="c" axis="1 0 0"/>
+      <geom name="hand" size=".05"/><site name="tip" pos=".1 0 0"/>
+      <body name="left" pos=".1 .02 0"><joint name="left" type="slide" axis="0 1 0"/>
+        <geom name="left" type="box" size=".03 .01 .01"/></body>
+      <body name="right" pos=".1 -.02 0"><joint name="right" type="slide" axis="0 1 0"/>
+        <geom name="right" type="box" size=".03 .01 .01"/></body>
+    </body></body></body></body></worldbody>
+<tendon><fixed name="grasp"><joint joint="left" coef="1"/></fixed></tendon>
+<equality><joint joint1="left" joint2="right"/></equality>
+<actuator>{MOTORS}<position tendon="grasp" kp="10"/></actuator>
+<sensor><jointpos joint="left"/></sensor>
+<keyframe><key name="home" qpos=".1 .2 .3 .01 .01"/></keyframe></mujoco>"""
+"""Fingers off the chain, with all that grippers come with: tendon, equality, sensor."""
+
+
+@pytest.fixture(scope="module", params=[ODD, GRIPPER], ids=["odd", "gripper"])
+def arm(request):
+    """An MJCF text and the robot from it."""
+    return request.param, Robot.from_mjcf(request.param, site="tip")
+
+
+def test_kinematics_and_dynamics_equal_mujoco(arm, ours):
+    """50 states. 1e-5: the arm's text rounds the MJCF's numbers to six digits."""
+    text, robot = arm
+    rng = np.random.default_rng(0)
+    q, qd = robot.q_ref + rng.uniform(-2, 2, (50, 3)), rng.normal(size=(50, 3))
+    terms = ours(robot, q, qd)[0]
+    exact = oracles.mujoco_terms(robot.mj_model, "tip", q, qd)
+    full = mujoco.MjModel.from_xml_string(text)
+    rest = np.tile(full.qpos0[3:], (50, 1))  # fingers locked at the reference
+    loose = oracles.mujoco_terms(
+        full, "tip", np.hstack([q, rest]), np.hstack([qd, 0.0 * rest])
+    )
+    chain = loose._replace(
+        J=loose.J[..., :3], Mq=loose.Mq[:, :3, :3], bias=loose.bias[:, :3]
+    )
+    for name, ours_, same, original in zip(
+        terms._fields, terms, exact, chain, strict=True
+    ):
+        np.testing.assert_allclose(ours_, same, rtol=0, atol=1e-11, err_msg=name)
+        scale = np.abs(original).max()
+        np.testing.assert_allclose(
+            ours_, original, rtol=0, atol=1e-5 * scale, err_msg=name
+        )
+
+
+def test_chain_is_read_from_the_file():
+    robot = Robot.from_mjcf(ODD, site="tip")
+    assert robot.joint_names == ("a", "b", "c")
+    assert robot.hinge == (False, True, True)
+    assert robot.body_names == ("body_0", "body_1", "body_2")
+    assert robot.tau_max.tolist() == [9.0, 8.0, 6.0]  # the last one has a gear of 2
+    np.testing.assert_allclose(robot.q_ref, [0.2, np.pi / 6, 0.0], atol=1e-6)
+    np.testing.assert_allclose(robot.q_home, robot.q_ref, atol=1e-6)  # no keyframe
+    # Degrees in the file, radians here; a joint without a range has infinite limits.
+    np.testing.assert_allclose(robot.q_lower[1], np.deg2rad(-100), rtol=1e-5)
+    assert np.isinf(robot.q_lower[[0, 2]]).all()
+    np.testing.assert_allclose(robot.armature, [0.3, 0.0, 0.0])
+    np.testing.assert_allclose(robot.gravity, [1.0, -2.0, -9.0])
+
+
+def test_fingers_are_locked_and_home_survives():
+    robot = Robot.from_mjcf(GRIPPER, site="tip")
+    assert robot.joint_names == ("a", "b", "c") and robot.mj_model.nv == 3
+    np.testing.assert_allclose(robot.q_home, [0.1, 0.2, 0.3])
+    assert "left" in robot.body_names  # still there to be kept off obstacles
+
+
+def test_a_shorter_chain_ends_at_its_site():
+    text = GRIPPER.replace('<geom name="two"', '<site name="elbow"/><geom name="two"')
+    robot = Robot.from_mjcf(text, site="elbow")
+    assert robot.joint_names == ("a", "b")
+    # What hangs on the locked joint moves with the last one.
+    np.testing.assert_allclose(
+        robot.mass.sum(),
+        robot.mj_model.body_mass.sum() - robot.mj_model.body("base").mass,
+    )
+
+
+def test_overrides_replace_what_the_file_says():
+    robot = Robot.from_mjcf(
+        GRIPPER,
+        site="tip",
+        joints=["a", "b", "c"],
+        links=["one", "hand"],
+        armature=[0.1, 0.2, 0.3],
+        torque_limits=[1.0, 2.0, 3.0],
+    )
+    assert robot.body_names == ("one", "hand")
+    assert set(robot.points.body) == {"one", "hand"}
+    np.testing.assert_allclose(robot.armature, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(robot.mj_model.dof_armature, [0.1, 0.2, 0.3])
+    assert robot.tau_max.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_file_with_meshes_loads_from_anywhere(tmp_path):
+    """The arm's text finds the mesh also where it is not the working folder."""
+    (tmp_path / "assets").mkdir()
+    corners = ["0 0 0", ".1 0 0", "0 .1 0", "0 0 .1"]
+    faces = ["1 3 2", "1 2 4", "1 4 3", "2 3 4"]
+    lines = [f"v {c}" for c in corners] + [f"f {f}" for f in faces]
+    (tmp_path / "assets" / "part.obj").write_text("\n".join(lines))
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco><compiler meshdir="assets"/>
+        <asset><mesh name="part" file="part.obj"/></asset>
+        <worldbody><body name="arm"><joint name="a" axis="0 0 1"/>
+        <geom type="mesh" mesh="part"/><site name="tip"/></body></worldbody>
+        <actuator><motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>"""
+    )
+    robot = Robot.from_mjcf(path, site="tip")
+    assert robot.mj_model.nmesh == 1 and len(robot.points.segment) > 0
+
+
+def test_the_robot_is_its_text():
+    """Reading `robot.mjcf` again gives the same arm to the last bit."""
+    robot = Robot.load(armature="robosuite")
+    again = Robot.from_mjcf(robot.mjcf, site="grip")
+    for name in ("offset", "rotation", "mass", "com", "inertia", "armature", "tau_max"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(robot, name))

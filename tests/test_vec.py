@@ -1,0 +1,52 @@
+"""Component-wise vectors against plain arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rmp_mjx.vec import Vec, store, sum_all
+
+RNG = np.random.default_rng(0)
+A, B = (RNG.normal(size=(5, 3)).astype(np.float32) for _ in range(2))
+
+
+def test_arithmetic_is_that_of_arrays():
+    """1e-6: a few float32 roundings of numbers of order one."""
+    a, b = Vec.of(A), Vec.of(B)
+    for ours, expected in (
+        (a + b, A + B),
+        (a - b, A - B),
+        (a * 2.5, A * 2.5),
+        (a.cross(b), np.cross(A, B)),
+        (a.map(jnp.maximum, b), np.maximum(A, B)),
+    ):
+        np.testing.assert_allclose(ours.stack(-1), expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(a @ b, np.sum(A * B, axis=1), rtol=1e-5, atol=1e-6)
+
+
+def test_split_and_stack_are_inverse_along_any_axis():
+    for axis in (0, 1, -1):
+        x = RNG.normal(size=(3, 3))
+        np.testing.assert_array_equal(Vec.of(x, axis).stack(axis), np.float32(x))
+
+
+def test_columns_broadcast_over_points():
+    difference = Vec.of(A) - Vec.column(B[:2])
+    np.testing.assert_allclose(difference.stack(-1), A[None] - B[:2, None], rtol=1e-6)
+
+
+def test_stack_broadcasts_components():
+    assert Vec(jnp.zeros(4), 0.0, jnp.ones((2, 1))).stack().shape == (3, 2, 4)
+
+
+def test_sums_in_one_pass_are_the_sums():
+    sums = sum_all((jnp.asarray(A), jnp.asarray(B)))
+    for ours, x in zip(sums, (A, B), strict=True):
+        np.testing.assert_allclose(ours, x.sum(0), rtol=1e-6, atol=1e-6)
+
+
+def test_stored_array_is_the_same_array_with_the_same_gradient():
+    np.testing.assert_array_equal(store(jnp.asarray(A)), A)
+    gradient = jax.grad(lambda x: jnp.sum(store(x) * B))(jnp.asarray(A))
+    np.testing.assert_array_equal(gradient, B)
+    assert jax.vmap(store)(jnp.asarray(A)).shape == A.shape
