@@ -37,8 +37,8 @@ class RootSystems(NamedTuple):
     """Their right-hand sides, (s, r)."""
     qdd: np.ndarray
     """The controller's acceleration in float64, (s, n)."""
-    qdd_float32: np.ndarray
-    """The same, all of the controller in float32."""
+    states: tuple[np.ndarray, ...]
+    """What they are of: q, qd (s, n), action (s, 12), centre of the sphere (s, 3)."""
 
 
 def control_points(robot: rmp.Robot, q: Array) -> Array:
@@ -64,6 +64,8 @@ def stack(ctrl: rmp.RMPVICES, q: Array, qd: Array, action: Array, center: Array)
         A (r, n) and b (r,) with A^T A the root's regularised metric and A^T b its f.
     """
     robot, n = ctrl.robot, ctrl.robot.n
+    if ctrl.collision is None or ctrl.joint_limit is None or ctrl.posture is None:
+        raise ValueError("the rows are those of a controller with all its branches")
     gap = functools.partial(distances, robot, center)
     d, rate, curvature = _second_jvp(gap, q, qd)
     f, m = ctrl.collision.scalar(d, rate)
@@ -90,7 +92,8 @@ def stack(ctrl: rmp.RMPVICES, q: Array, qd: Array, action: Array, center: Array)
     posture = w * L, w * (L @ ctrl.posture.acceleration(q, qd))
     regulariser = jnp.sqrt(ctrl.regularizer) * L, jnp.zeros(n)
     parts = (collision, limit, position, orientation, posture, regulariser)
-    return tuple(jnp.concatenate(column) for column in zip(*parts, strict=True))
+    A, b = zip(*parts, strict=True)
+    return jnp.concatenate(A), jnp.concatenate(b)
 
 
 def _second_jvp(function: Any, q: Array, qd: Array) -> tuple[Array, Array, Array]:
@@ -166,8 +169,16 @@ class RootSampler:
             keep = np.flatnonzero(good)[:count]
             if len(keep) < count:
                 raise RuntimeError(f"{len(keep)} of {count} states fit {clearance} m")
-            states = [z[keep] for z in (q, qd, action, center)]
+            states = tuple(z[keep] for z in (q, qd, action, center))
             A, b = (np.asarray(y) for y in self._rows(leaf, *states))
             qdd = np.asarray(self._qdd(leaf, *states))
-        single = [jnp.asarray(z, jnp.float32) for z in states]
-        return RootSystems(A, b, qdd, np.asarray(self._qdd(leaf, *single)))
+        return RootSystems(A, b, qdd, states)
+
+    def float32(self, leaf: ScalarLeaf, systems: RootSystems) -> np.ndarray:
+        """The controller's accelerations with everything in float32, (s, n).
+
+        Call `jax.clear_caches` between `draw` and this: what JAX traced in one
+        precision it would find again in the other.
+        """
+        single = (jnp.asarray(z, jnp.float32) for z in systems.states)
+        return np.asarray(self._qdd(leaf, *single))

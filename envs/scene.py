@@ -52,6 +52,7 @@ def build_scene(
     spec = mujoco.MjSpec.from_file(str(ASSETS / "arena.xml"))
     spec.option.timestep = sim_dt
     arm = mujoco.MjSpec.from_string(robot.mjcf)
+    arm.option.timestep = sim_dt  # else attaching warns of a conflict
     for key in list(arm.keys):
         arm.delete(key)
     spec.attach(arm, prefix=ARM, frame=spec.worldbody.add_frame())

@@ -26,7 +26,7 @@ class TrainConfig:
     """Physics engine: mujoco (C threads), mjx (JAX), or auto: mujoco on a CPU."""
     num_envs: int = 256
     """Environments that run in parallel."""
-    num_timesteps: int = 500_000
+    num_timesteps: int = 400_000
     """Policy steps over all environments, rounded up to whole iterations."""
     seed: int = 0
     """Seed of the networks, the environments and the minibatch order."""

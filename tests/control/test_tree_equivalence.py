@@ -1,6 +1,7 @@
 """The fast evaluation against the tree that defines it, in float64."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,11 @@ import pytest
 
 from rmp_mjx import RMPVICES, Node, Siblings
 from rmp_mjx.control.tree import rmp_vices_tree
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state
+from tests.control.conftest import QUICK
+
+quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +58,10 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
     One Jacobian of all leaf coordinates stacked, no message passing. 1e-7 relative:
     row weights span six orders.
     """
-    eps = 0.02
 
-    @jax.jit
-    def leaf_terms(q, qd, action, obstacles, Mq):
+    @quick_jit
+    def leaf_terms(q, qd, action, obstacles):
+        Mq, _ = dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))
         setpoint = ctrl.setpoint(q, ctrl.decode(action))
         tree = rmp_vices_tree(ctrl, setpoint, obstacles, Mq)
 
@@ -65,7 +71,7 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
         def rates(s):
             return jax.jvp(lambda s: values(q + s * qd, s), (s,), (1.0,))
 
-        (y, yd), (_, ydd) = jax.jvp(rates, (0.0,), (1.0,))
+        (_, yd), (_, ydd) = jax.jvp(rates, (0.0,), (1.0,))
         J = jax.jacfwd(values)(q, 0.0)
         terms = []
         for (leaf, x), xd, c, j in zip(
@@ -76,22 +82,13 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
                 axes = jax.tree.map(lambda a: 0 if jnp.ndim(a) else None, leaf)
                 evaluate = jax.vmap(evaluate, in_axes=(axes, 0, 0))
             terms.append((j, c, evaluate(leaf, x, xd)))
-        del y
-        return terms
-
-    @jax.jit
-    def inertia(q, qd):
-        from rmp_mjx.robot.dynamics import dynamics
-        from rmp_mjx.robot.kinematics import arm_state
-
-        return dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))[0]
+        return Mq, terms
 
     eps = ctrl.regularizer
     for k in range(10):
         q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
         with jax.enable_x64(True):
-            Mq = jax.device_get(inertia(q, qd))
-            terms = jax.device_get(leaf_terms(q, qd, action, obstacles, Mq))
+            Mq, terms = jax.device_get(leaf_terms(q, qd, action, obstacles))
         rows, rhs = [np.sqrt(eps) * np.linalg.cholesky(Mq).T], [np.zeros(7)]
         for J, c, rmp in terms:
             m = c.shape[-1]

@@ -56,7 +56,9 @@ def make():
         options = {"physics": "mujoco", "obstacles": 2} | options
         env = envs.load("trajectory", controller=controller, **options)
         return SimpleNamespace(
-            env=env, reset=jax.jit(jax.vmap(env.reset)), step=jax.jit(jax.vmap(env.step))
+            env=env,
+            reset=jax.jit(jax.vmap(env.reset)),
+            step=jax.jit(jax.vmap(env.step)),
         )
 
     return build
@@ -92,7 +94,9 @@ def quiet(far):
     q = jnp.tile(far.env.robot.q_home.astype(np.float32), (LANES, 1))
     away = jnp.broadcast_to(jnp.array([0.0, 0.0, -5.0]), state.data.mocap_pos.shape)
     data = state.data.replace(qpos=q, qvel=0 * q, mocap_pos=away)
-    points = jnp.array([[0.3, 0.2, 0.2], [0.5, 0.2, 0.2], [0.5, -0.2, 0.2], [0.3, 0, 0.3]])
+    points = jnp.array(
+        [[0.3, 0.2, 0.2], [0.5, 0.2, 0.2], [0.5, -0.2, 0.2], [0.3, 0, 0.3]]
+    )
     info = state.info | {"points": jnp.tile(points, (LANES, 1, 1))}
     return state.replace(data=data, info=info)
 
@@ -114,7 +118,11 @@ class Arm:
         d.qvel[:] = 0.0 if qd is None else qd
         mujoco.mj_kinematics(self.model, d)
         mujoco.mj_comPos(self.model, d)
-        site, jp, jr = self.model.site("arm/grip").id, np.zeros((3, 7)), np.zeros((3, 7))
+        site, jp, jr = (
+            self.model.site("arm/grip").id,
+            np.zeros((3, 7)),
+            np.zeros((3, 7)),
+        )
         mujoco.mj_jacSite(self.model, d, jp, jr, site)
         return (
             d.site_xpos[site].copy(),

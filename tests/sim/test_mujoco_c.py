@@ -200,7 +200,7 @@ def test_contact_sensors_are_the_contact_forces_of_mujoco(
 
 
 def test_an_unknown_engine_is_refused_with_the_valid_names(weights):
-    with pytest.raises(PhysicsError, match="'bullet'.*auto, mujoco, mjx"):
+    with pytest.raises(PhysicsError, match=r"'bullet'.*auto, mujoco, mjx"):
         load_physics("bullet", weights)
 
 

@@ -1,0 +1,69 @@
+"""Names and options that do not exist are refused before anything compiles."""
+
+import numpy as np
+import pytest
+
+import envs
+from envs.base import SAFETY_METRICS, substeps
+
+
+def test_an_unknown_task_lists_the_tasks_and_suggests_one():
+    with pytest.raises(ValueError, match=r"'trajectry'.*trajectory.*Did you mean"):
+        envs.load("trajectry")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"obstacle": 2}, "'obstacle'.*obstacles.*Did you mean 'obstacles'"),
+        ({"controller": "osc"}, "'osc'.*rmp_vices, vices"),
+        ({"physics": "bullet"}, "'bullet'.*auto, mujoco, mjx"),
+        ({"layout": "near"}, "'near'.*far, close"),
+        ({"observation": "image"}, "'image'.*rotated, fixed"),
+        ({"armature": "none"}, "'none'.*physical, robosuite"),
+        ({"obstacles": -1}, "obstacles must be at least 0"),
+        ({"sphere_radius": 0.0}, "sphere_radius positive"),
+        ({"sim_dt": 0.004}, "0.004 s does not divide the policy step of 0.05 s"),
+        ({"sim_dt": 0.0}, "sim_dt must be in"),
+        ({"sim_dt": -0.005}, "sim_dt must be in"),
+        ({"sim_dt": 0.1}, "sim_dt must be in"),
+        ({"sim_dt": float("nan")}, "sim_dt must be in"),
+    ],
+)
+def test_a_wrong_option_is_refused_with_the_valid_ones(options, message):
+    with pytest.raises(ValueError, match=message):
+        envs.load("trajectory", **options)
+
+
+@pytest.mark.parametrize("sim_dt", [0.001, 0.002, 0.0025, 0.005, 0.01, 0.05])
+def test_a_policy_step_lasts_its_physics_steps(sim_dt):
+    n = substeps(0.05, sim_dt)
+    assert n * sim_dt == pytest.approx(0.05, abs=1e-12)
+
+
+def test_the_physics_steps_by_the_chosen_timestep():
+    env = envs.load("trajectory", physics="mujoco", sim_dt=0.0025)
+    assert env.scene.model.opt.timestep == 0.0025
+    assert env.n_substeps == 20
+    assert env.dt == 0.05 and env.action_size == 12
+
+
+def test_every_metric_says_how_it_folds_into_an_episode():
+    env = envs.load("trajectory", physics="mujoco")
+    assert SAFETY_METRICS.items() <= env.metric_reductions.items()
+    assert {"via_points", "success"} <= env.metric_reductions.keys()
+    assert set(env.metric_reductions.values()) <= {"sum", "max", "mean", "last"}
+
+
+def test_only_the_watched_pairs_can_collide():
+    """Table with all links that can reach it, spheres with all moving links."""
+    scene = envs.load("trajectory", physics="mujoco", obstacles=2).scene
+    model = scene.model
+    assert not model.geom_contype.any() and not model.geom_conaffinity.any()
+    pairs = [model.pair(k).name for k in range(model.npair)]
+    links = [f"arm/link_{i}" for i in range(1, 7)] + ["arm/hand", "arm/fingers"]
+    for link in links:
+        assert (f"{link}/table" in pairs) == (link != "arm/link_1")
+        assert f"{link}/sphere_0" in pairs and f"{link}/sphere_1" in pairs
+    assert np.all(scene.hand.astype(int) + scene.arm + scene.own == 1)
+    assert np.sum(scene.hand) == 2 * 3  # hand and fingers, with table and two spheres

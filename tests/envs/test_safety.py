@@ -1,0 +1,114 @@
+"""The safety record against MuJoCo C's own contacts, and what an event costs."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import LANES
+
+DOWN, SPHERE, SIDE, LIMIT, TURN = 0, 1, 2, 3, 4  # lanes; the others rest
+REST = jnp.zeros((LANES, 12))
+
+
+@pytest.fixture(scope="module")
+def scripted(quiet, arm):
+    """One lane falls onto the table, one onto a sphere, one starts in a sphere that
+    touches the forearm, one near a joint limit, one near two turns of a free joint."""
+    robot_q = np.array(quiet.data.qpos)
+    mocap = np.array(quiet.data.mocap_pos)
+    grip = arm.site(robot_q[0])[0]
+    mocap[SPHERE, 1] = grip - np.array([0.0, 0.0, 0.06])
+    elbow = arm.data.geom("arm/link_5").xpos
+    mocap[SIDE, 0] = elbow + np.array([0.0, 0.0, 0.041 + 0.05 - 0.003])
+    robot_q[LIMIT, 5] = 5.14872 - 0.099
+    robot_q[TURN, 0] = 2 * np.pi - 0.09
+    data = quiet.data.replace(qpos=jnp.asarray(robot_q), mocap_pos=jnp.asarray(mocap))
+    action = REST.at[DOWN, 1].set(25.0).at[SPHERE, 1].set(25.0)
+    return quiet.replace(data=data), action
+
+
+def roll_both(task, arm, state, action, steps):
+    """Policy steps of the task beside those of MuJoCo C, for every lane."""
+    tau = np.asarray(task.env.controller.hold) + np.concatenate(
+        [np.asarray(action[:, :6]), np.zeros((LANES, 1))], axis=1
+    )
+    for _ in range(steps):
+        rows = []
+        for lane in range(LANES):
+            data = {
+                name: np.asarray(getattr(state.data, name)[lane])
+                for name in ("qpos", "qvel", "warmstart", "mocap_pos")
+            }
+            rows.append(arm.roll(Fields(data), tau[lane], task.env.n_substeps))
+        state = task.step(state, action)
+        yield state, rows
+
+
+class Fields:
+    def __init__(self, values):
+        self.__dict__.update(values)
+
+
+def test_record_is_what_mujoco_reports_lane_by_lane(close, arm, scripted):
+    """Forces within 2 % or 0.5 N: the task rounds its state to float32 ten times a
+    policy step, and a stiff impact amplifies that. Flags are equal."""
+    seen = set()
+    for after, rows in roll_both(close, arm, *scripted, steps=10):
+        for lane, steps in enumerate(rows):
+            pairs = {p for _, force in steps for p in force}
+            own = {p for p in pairs if all(n.startswith("arm/") for n in p)}
+            world = pairs - own
+            hand = {"arm/hand", "arm/fingers"}
+            flags = (
+                ("collision", bool(world)),
+                ("arm_collision", any(not (p & hand) for p in world)),
+                ("self_collision", bool(own)),
+            )
+            for name, expected in flags:
+                assert bool(after.metrics[name][lane]) == expected, (name, lane)
+            mean = np.mean([sum(force.values()) for _, force in steps])
+            peak = max((f for _, force in steps for f in force.values()), default=0.0)
+            for name, expected in (
+                ("contact_force", mean),
+                ("contact_force_peak", peak),
+            ):
+                assert after.metrics[name][lane] == pytest.approx(
+                    expected, rel=0.02, abs=0.5
+                )
+            seen |= {(lane, *sorted(p)) for p in pairs}
+    assert (DOWN, "arm/fingers", "table") in seen
+    assert (SPHERE, "arm/fingers", "sphere_1") in seen
+    assert (SIDE, "arm/link_5", "sphere_0") in seen
+    assert {lane for lane, *_ in seen} == {DOWN, SPHERE, SIDE}
+
+
+def test_joint_limit_events_begin_a_tenth_of_a_radian_from_the_limit(far, scripted):
+    after = far.step(scripted[0], REST)
+    np.testing.assert_array_equal(after.metrics["joint_limit"], np.eye(LANES)[LIMIT])
+    np.testing.assert_array_equal(after.metrics["turn_limit"], np.eye(LANES)[TURN])
+
+
+def test_an_event_costs_its_penalty_and_ends_the_episode(far, quiet, scripted):
+    clean, after = far.step(quiet, REST), far.step(scripted[0], REST)
+    assert after.done[LIMIT] == 1 and after.done[SIDE] == 1
+    assert after.reward[SIDE] == pytest.approx(float(clean.reward[SIDE]) - 50, abs=1.0)
+    assert after.done[TURN] == 0  # counted, not punished: the joint turns for ever
+    resting = np.arange(LANES) > TURN
+    assert not np.any(np.asarray(after.done)[resting])
+    np.testing.assert_array_equal(after.reward[resting], clean.reward[resting])
+
+
+def test_penalty_and_termination_can_be_switched(far, close, scripted):
+    hard, soft = far.step(scripted[0], REST), close.step(scripted[0], REST)
+    event = hard.done == 1
+    assert np.sum(event) == 2 and not np.any(soft.done)
+    np.testing.assert_allclose(
+        soft.reward - hard.reward, np.where(event, 50.0 - 7.0, 0.0), atol=1e-3
+    )
+
+
+def test_a_sphere_that_found_no_place_is_counted(far, quiet):
+    placed = jnp.ones((LANES, 2), bool).at[1, 0].set(False).at[2].set(False)
+    after = far.step(quiet.replace(info=quiet.info | {"placed": placed}), REST)
+    np.testing.assert_array_equal(
+        after.metrics["unplaced_spheres"], [0, 1, 2, 0, 0, 0, 0, 0]
+    )
