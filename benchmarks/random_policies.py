@@ -136,7 +136,12 @@ def safety_rows(name: str, policy: str, figures: Figures) -> list[Row]:
         ("speed", figures["speed"].mean(), "m/s", "end effector, mean"),
         ("saturation", figures["saturation"].mean(), "", "share of physics steps"),
         ("torque_jump_p99", np.quantile(jump, 0.99), "N m", worst),
-        ("reversals", figures["reversals"].mean(), "1/step", "torques > 1 N m"),
+        (
+            "reversals",
+            figures["reversals"].mean(),
+            "1/step",
+            "physics steps in which a torque turns round by > 1 N m",
+        ),
         ("force_peak", figures["force"].max(), "N", "worst contact"),
     ):
         rows.append(Row(f"{name}_{policy}_{key}", float(value), unit, note))

@@ -152,7 +152,7 @@ class RootSampler:
         """
         robot, n = self.ctrl.robot, self.ctrl.robot.n
         rng = np.random.default_rng(seed)
-        tries = 16 * count
+        tries = 48 * count
         q = np.asarray(robot.q_home) + 0.4 * rng.standard_normal((tries, n))
         qd = 0.5 * rng.standard_normal((tries, n))
         action = rng.uniform(-1, 1, (tries, rmp.ACTION_SIZE))

@@ -36,7 +36,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Timestep and solver convergence.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--plot", type=Path, help="draw the path errors to this file")
-    parser.add_argument("--num-envs", type=int, default=256, help="random episodes")
+    parser.add_argument("--num-envs", type=int, default=128, help="random episodes")
     parser.add_argument("--seed", type=int, default=0, help="of starts and actions")
     parser.add_argument("--quick", action="store_true", help="a smoke test")
     return parser.parse_args(argv)
@@ -248,9 +248,9 @@ def main(argv: list[str] | None = None) -> None:
     study, rows, rough = Study(size, args.seed), [], None
     for controller in CONTROLLERS:
         best = study.run(controller, timesteps[0])
+        note = f"against {timesteps[0] * 1e3:g} ms"
         for dt in timesteps:
             mine = best if dt == timesteps[0] else study.run(controller, dt)
-            note = f"against {timesteps[0] * 1e3:g} ms"
             name = f"{controller}_{dt * 1e3:g}ms"
             rows += compare(name, mine, best, note)
             rough = mine if dt == 5e-3 else rough

@@ -31,18 +31,19 @@ def test_a_stiffness_survives_the_way_through_an_action():
 def test_the_hard_policy_moves_near_its_limits_and_stays_stiff():
     hard = policies.hard()
     keys = jax.random.split(jax.random.key(0), 64)
-    action = jax.vmap(hard.start)(keys)
+    action = jax.jit(jax.vmap(hard.start))(keys)
     assert (jnp.abs(action[:, :6]) >= 0.8).all() and (jnp.abs(action) <= 1.0).all()
-    kp = jax.vmap(ActionRange().decode)(action).kp_pos
+    kp = jax.jit(jax.vmap(ActionRange().decode))(action).kp_pos
     assert (kp >= 149.9).all() and (kp <= 300.1).all()
 
 
 def test_the_smooth_policy_keeps_its_variance():
     smooth = policies.smooth(deviation=0.5)
-    memory = jax.vmap(smooth.start)(jax.random.split(jax.random.key(1), 512))
+    memory = jax.jit(jax.vmap(smooth.start))(jax.random.split(jax.random.key(1), 512))
     keys = jax.random.split(jax.random.key(2), 20 * 512).reshape(20, 512)
+    act = jax.jit(jax.vmap(smooth.act, (0, 0, None)))
     for key in keys:
-        memory, action = jax.vmap(smooth.act, (0, 0, None))(memory, key, jnp.zeros(3))
+        memory, action = act(memory, key, jnp.zeros(3))
         assert (jnp.abs(action) <= 1.0).all()
     # 6144 correlated samples: the standard error of the deviation is under 1 %.
     assert float(memory.std()) == pytest.approx(0.5, rel=0.04)
@@ -66,7 +67,8 @@ def test_every_solver_solves_a_well_conditioned_system(name):
     A = rng.standard_normal((1, 30, 7)).astype(np.float32)
     b = rng.standard_normal((1, 30)).astype(np.float32)
     exact = np.linalg.lstsq(A[0].astype(float), b[0].astype(float), rcond=None)[0]
-    x = solve_accuracy.batched(solve_accuracy.SOLVERS[name])(A, b)[0]
+    solve = jax.jit(solve_accuracy.batched(solve_accuracy.SOLVERS[name]))
+    x = solve(A, b)[0]
     # Condition of the normal equations is about 10; RMP2's damping itself costs 1e-4.
     tolerance = 1e-3 if name == "identity_damped" else 1e-5
     assert np.linalg.norm(x - exact) < tolerance * np.linalg.norm(exact)

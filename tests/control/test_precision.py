@@ -17,7 +17,9 @@ def test_float32_is_close_to_float64_with_obstacles_near(
     """2,000 states, control points inside obstacles or up to 20 cm away.
 
     The metrics are capped at 1e3 and the root is regularised by the inertia, so the
-    error stays at float32's rounding times the root's condition.
+    error stays at float32's rounding times the root's condition. Measured, as a share
+    of the torque limits: median 7e-6, 90 % 3e-4, 99 % 5e-3, largest 3e-2; the
+    acceleration's largest relative error is 4e-2. The bounds leave a factor of three.
     """
     worst, errors, clearances = 0.0, [], []
     for seed in range(4):
@@ -29,11 +31,10 @@ def test_float32_is_close_to_float64_with_obstacles_near(
         difference = np.abs(single.qdd - double.qdd).max(1)
         worst = max(worst, np.max(difference / (1.0 + np.abs(double.qdd).max(1))))
     errors, clearances = np.concatenate(errors), np.concatenate(clearances)
-    print(
-        np.quantile(errors, [0.5, 0.9, 0.99, 1]),
-        worst,
-        np.quantile(clearances, [0, 0.1, 0.5, 0.9, 1]),
-    )
+    assert np.quantile(errors, 0.5) < 5e-5
+    assert np.quantile(errors, 0.99) < 1.5e-2
+    assert errors.max() < 0.1
+    assert worst < 0.1
     assert np.mean(clearances < 0.05) > 0.5
 
 

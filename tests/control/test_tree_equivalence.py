@@ -60,7 +60,7 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
     """
 
     @quick_jit
-    def leaf_terms(q, qd, action, obstacles):
+    def leaf_terms(ctrl, q, qd, action, obstacles):
         Mq, _ = dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))
         setpoint = ctrl.setpoint(q, ctrl.decode(action))
         tree = rmp_vices_tree(ctrl, setpoint, obstacles, Mq)
@@ -88,7 +88,7 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
     for k in range(10):
         q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
         with jax.enable_x64(True):
-            Mq, terms = jax.device_get(leaf_terms(q, qd, action, obstacles))
+            Mq, terms = jax.device_get(leaf_terms(ctrl, q, qd, action, obstacles))
         rows, rhs = [np.sqrt(eps) * np.linalg.cholesky(Mq).T], [np.zeros(7)]
         for J, c, rmp in terms:
             m = c.shape[-1]

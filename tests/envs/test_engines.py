@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LANES
+from arm_tasks import LANES
 
 
 def test_both_engines_step_the_task_alike(make, close, quiet):

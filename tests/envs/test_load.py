@@ -30,6 +30,7 @@ def test_an_unknown_task_lists_the_tasks_and_suggests_one():
         ({"sim_dt": float("nan")}, "sim_dt must be in"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:Attach conflict")
 def test_a_wrong_option_is_refused_with_the_valid_ones(options, message):
     with pytest.raises(ValueError, match=message):
         envs.load("trajectory", **options)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LANES, first
+from arm_tasks import LANES, first
 
 REST = jnp.zeros((LANES, 12))
 

@@ -1,5 +1,7 @@
 """Closed-form kinematics against autodiff of the map, and against MuJoCo's points."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -25,8 +27,8 @@ def test_jacobian_and_curvature_are_the_derivatives_of_the_pose(robot, states, o
     """Forward-mode autodiff of `site_pose`, once and twice."""
 
     @jax.jit
-    @jax.vmap
-    def derivatives(q, qd):
+    @functools.partial(jax.vmap, in_axes=(None, 0, 0))
+    def derivatives(robot, q, qd):
         def position(q):
             return site_pose(robot, q)[0]
 
@@ -36,7 +38,7 @@ def test_jacobian_and_curvature_are_the_derivatives_of_the_pose(robot, states, o
         return jax.jacfwd(position)(q), jax.jvp(velocity, (q,), (qd,))[1]
 
     with jax.enable_x64(True):
-        J, Jdot_qd = jax.device_get(derivatives(*states))
+        J, Jdot_qd = jax.device_get(derivatives(robot, *states))
     terms = ours_at[0]
     # Rounding of a chain of seven products, lengths of 1 m, speeds of 10 rad/s.
     np.testing.assert_allclose(terms.J[:, :3], J, rtol=0.0, atol=1e-12)

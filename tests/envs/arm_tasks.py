@@ -1,0 +1,82 @@
+"""What the tests of the tasks share: a toy controller, and MuJoCo C as the judge."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from rmp_mjx.types import ControlOutput, Setpoint
+
+LANES = 8
+
+
+@struct.dataclass
+class Torques:
+    """A controller that compiles fast: the action is a torque on top of `hold`."""
+
+    hold: jax.Array
+
+    def decode(self, action):
+        return action
+
+    def setpoint(self, q, action):
+        return Setpoint(jnp.zeros(3), jnp.eye(3), action[:3], action[3:6])
+
+    def __call__(self, q, qd, setpoint, obstacles):
+        push = jnp.concatenate([setpoint.kp_pos, setpoint.kp_ori, jnp.zeros(1)])
+        tau = self.hold + push
+        return ControlOutput(
+            tau=tau,
+            qdd=tau,
+            f=tau,
+            M=jnp.eye(7),
+            diagnostics={"torque_scale": jnp.where(push[5] > 0.0, 0.5, 1.0)},
+        )
+
+
+def first(state, count=LANES):
+    return jax.tree.map(lambda x: x[:count], state)
+
+
+class Arm:
+    """Poses, velocities and contact forces of a scene, by MuJoCo C alone."""
+
+    def __init__(self, model):
+        self.model, self.data = model, mujoco.MjData(model)
+
+    def site(self, q, qd=None):
+        """Position, rotation, velocity and angular velocity of the grip."""
+        d = self.data
+        d.qpos[:] = q
+        d.qvel[:] = 0.0 if qd is None else qd
+        mujoco.mj_kinematics(self.model, d)
+        mujoco.mj_comPos(self.model, d)
+        site, jp, jr = (
+            self.model.site("arm/grip").id,
+            np.zeros((3, 7)),
+            np.zeros((3, 7)),
+        )
+        mujoco.mj_jacSite(self.model, d, jp, jr, site)
+        return (
+            d.site_xpos[site].copy(),
+            d.site_xmat[site].reshape(3, 3).copy(),
+            jp @ d.qvel,
+            jr @ d.qvel,
+        )
+
+    def roll(self, data, tau, steps):
+        """Constant torque for some physics steps: (q, touched, sum, peak) of each."""
+        d, rows = mujoco.MjData(self.model), []
+        d.qpos[:], d.qvel[:] = data.qpos, data.qvel
+        d.qacc_warmstart[:], d.mocap_pos[:] = data.warmstart, data.mocap_pos
+        d.ctrl[:] = tau
+        for _ in range(steps):
+            mujoco.mj_step(self.model, d)
+            force, wrench = {}, np.zeros(6)
+            for k, contact in enumerate(d.contact):
+                mujoco.mj_contactForce(self.model, d, k, wrench)
+                pair = frozenset(self.model.geom(g).name for g in contact.geom)
+                force[pair] = force.get(pair, 0.0) + wrench[0]
+            rows.append((d.qpos.copy(), force))
+        return rows
