@@ -27,7 +27,7 @@ def test_the_defaults_are_valid():
     [
         ({"env": "trajectroy"}, "known: door, trajectory. Did you mean 'trajectory'"),
         ({"controller": "pid"}, "known: rmp_vices, vices"),
-        ({"physics": "bullet"}, "known: mujoco, mjx"),
+        ({"physics": "bullet"}, "known: auto, mujoco, mjx"),
         ({"num_envs": 0}, "num_envs must be at least 1"),
         ({"num_envs": 3, "unroll_length": 5}, "3 * 5 = 15 does not divide into"),
         ({"learning_rate": 0.0}, "learning_rate must be positive"),
