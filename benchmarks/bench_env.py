@@ -6,6 +6,7 @@ Run as ``python -m benchmarks.bench_env --json FILE``.
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 
 import jax
@@ -14,7 +15,7 @@ import envs
 from benchmarks.common import Row, measure, show, write_json
 from rmp_mjx import runtime
 
-ENGINES = ("mjx", "mujoco")
+ENGINES = ("mujoco", "mjx")
 SIZES = (256, 1024, 2048)
 WARM_UP = 10  # random policy steps before timing, so that the arms are moving
 
@@ -31,6 +32,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         action="append",
         help="measure only this physics engine; may be repeated (default: all)",
     )
+    parser.add_argument("--num_envs", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each size")
     return parser.parse_args(argv)
 
 
@@ -48,7 +51,6 @@ def measure_engine(
     env = envs.load("trajectory", controller="rmp_vices", physics=engine)
     reset, step = jax.jit(jax.vmap(env.reset)), jax.vmap(env.step)
     substeps = f"{env.n_substeps} x {env.sim_dt * 1e3:g} ms"
-    walk = jax.jit(lambda s, a: jax.lax.scan(lambda s, a: (step(s, a), 0), s, a)[0])
     rows = []
     for size in sizes:
         key_reset, key_action = jax.random.split(jax.random.key(seed))
@@ -56,7 +58,11 @@ def measure_engine(
         actions = jax.random.uniform(
             key_action, (WARM_UP + 1, size, env.action_size), minval=-1.0, maxval=1.0
         )
-        state = jax.block_until_ready(walk(state, actions[:-1]))
+        start = time.perf_counter()
+        compiled = jax.jit(step).lower(state, actions[0]).compile()
+        compile_s = time.perf_counter() - start
+        for action in actions[:-1]:
+            state = jax.block_until_ready(compiled(state, action))
         timing = measure(step, state, actions[-1], seconds=seconds)
         rate = size / timing.median
         note = f"substeps {substeps}; {timing.spread}"
@@ -65,7 +71,7 @@ def measure_engine(
         rows.append(Row(f"physics_steps_per_s_{engine}_{size}", physics, "1/s", note))
         if size == sizes[-1]:
             alone = controller_time(env, state, actions[-1], seconds)
-            share, compile_s = alone / timing.median, timing.compile_s
+            share = alone / timing.median
             note = f"{size} environments, no compile cache"
             rows.append(Row(f"compile_s_env_{engine}", compile_s, "s", note))
             note = f"{size} environments; controller timed alone"
@@ -98,16 +104,17 @@ def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write where asked to."""
     args = parse(argv)
     runtime.configure(compile_cache=False)
-    sizes, seconds = ((64,), 1.0) if args.quick else (SIZES, 10.0)
+    sizes = (64,) if args.quick else tuple(args.num_envs)
+    seconds = 1.0 if args.quick else args.seconds
+    sizes_text = ", ".join(map(str, sizes))
     rows = []
     for engine in args.engine or ENGINES:
         rows += measure_engine(engine, sizes, args.seed, seconds)
+        if args.json:  # after each engine: nothing is lost if the next one is stopped
+            write_json(
+                args.json, rows, seed=args.seed, num_envs=sizes_text, quick=args.quick
+            )
     show(rows, "Trajectory task, RMP-VICES")
-    if args.json:
-        sizes_text = ", ".join(map(str, sizes))
-        write_json(
-            args.json, rows, seed=args.seed, num_envs=sizes_text, quick=args.quick
-        )
 
 
 if __name__ == "__main__":
