@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 
 from envs.base import ArmEnv as ArmEnv
 from envs.base import State as State
 from envs.trajectory import Trajectory
+from rmp_mjx.robot.mjcf import unknown
 
 ENVS: dict[str, type[ArmEnv]] = {"trajectory": Trajectory}
 """Tasks by name."""
@@ -30,15 +30,9 @@ def load(name: str, **options) -> ArmEnv:
         ValueError: Unknown task, option, or value; the message lists the valid ones.
     """
     if name not in ENVS:
-        raise ValueError(_unknown("env", name, names()))
+        raise ValueError(unknown("env", name, names()))
     valid = list(inspect.signature(ENVS[name]).parameters)
     for option in options:
         if option not in valid:
-            raise ValueError(_unknown(f"option of '{name}'", option, valid))
+            raise ValueError(unknown(f"option of '{name}'", option, valid))
     return ENVS[name](**options)
-
-
-def _unknown(kind: str, name: str, valid) -> str:
-    near = difflib.get_close_matches(name, valid, n=1)
-    hint = f" Did you mean '{near[0]}'?" if near else ""
-    return f"unknown {kind} '{name}'; valid names: {', '.join(valid)}.{hint}"

@@ -75,6 +75,11 @@ class Vec:
         )
 
 
+def xyz(v: Vec) -> tuple[Array, Array, Array]:
+    """The components, to unpack or to iterate over."""
+    return v.x, v.y, v.z
+
+
 def sum_all(terms: tuple[Array, ...]) -> tuple[Array, ...]:
     """Sum several arrays of one shape over their first axis, in a single pass.
 

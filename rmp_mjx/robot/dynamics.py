@@ -14,7 +14,7 @@ from rmp_mjx.robot.kinematics import (
     joint_metric,
 )
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.vec import Vec, store
+from rmp_mjx.vec import Vec, store, xyz
 
 
 def dynamics(
@@ -46,13 +46,13 @@ def dynamics(
     xx, yy, zz = (
         row[i] + cc - m * x
         for i, (row, m, x) in enumerate(
-            zip(map(_xyz, rows), _xyz(moment), _xyz(c), strict=True)
+            zip(map(xyz, rows), xyz(moment), xyz(c), strict=True)
         )
     )
     xy = rows[0].y - moment.x * c.y
     xz = rows[0].z - moment.x * c.z
     yz = rows[1].z - moment.y * c.z
-    own = [mass, *_xyz(moment), xx, xy, xz, yy, yz, zz, *_xyz(force), *_xyz(torque)]
+    own = [mass, *xyz(moment), xx, xy, xz, yy, yz, zz, *xyz(force), *xyz(torque)]
     outward = np.tril(np.ones((n, n)))  # sums over links k, k + 1, ...
     sums = jnp.matmul(
         jnp.stack(own), jnp.asarray(outward, arm.p.dtype), precision="highest"
@@ -88,7 +88,3 @@ def _world_inertia(robot: Robot, arm: ArmState) -> tuple[Vec, Vec, Vec]:
     a, b, c = RI
     xy, xz, yz = a @ R[1], a @ R[2], b @ R[2]
     return Vec(a @ R[0], xy, xz), Vec(xy, b @ R[1], yz), Vec(xz, yz, c @ R[2])
-
-
-def _xyz(v: Vec) -> tuple[Array, Array, Array]:
-    return v.x, v.y, v.z

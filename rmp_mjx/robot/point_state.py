@@ -17,7 +17,7 @@ from rmp_mjx.robot.kinematics import (
     select,
 )
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.vec import Vec
+from rmp_mjx.vec import Vec, xyz
 
 
 @struct.dataclass
@@ -92,10 +92,10 @@ def pull_to_joints(
     force = rmp.f - Vec(*(row @ points.a for row in rows))
     # Columns of [x] M are x cross the rows of M (symmetric); then once more by rows.
     a, b, c = (x.cross(row) for row in rows)
-    turned = [x.cross(Vec(*row)) for row in zip(_xyz(a), _xyz(b), _xyz(c), strict=True)]
-    fields = [*_xyz(force), *_xyz(x.cross(force))]
+    turned = [x.cross(Vec(*row)) for row in zip(xyz(a), xyz(b), xyz(c), strict=True)]
+    fields = [*xyz(force), *xyz(x.cross(force))]
     fields += [rmp.xx, rmp.xy, rmp.xz, rmp.yy, rmp.yz, rmp.zz]
-    fields += [*_xyz(a), *_xyz(b), *_xyz(c)]
+    fields += [*xyz(a), *xyz(b), *xyz(c)]
     fields += [turned[0].x, turned[0].y, turned[0].z]
     fields += [turned[1].y, turned[1].z, turned[2].z]
     segment = np.array(robot.points.segment, int)
@@ -120,7 +120,3 @@ def pull_to_joints(
         ),
     )
     return RMP(f=joint_forces(arm.S, sums[:6]), M=joint_metric(arm.S, momentum))
-
-
-def _xyz(v: Vec) -> tuple[Array, Array, Array]:
-    return v.x, v.y, v.z
