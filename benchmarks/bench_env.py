@@ -83,8 +83,8 @@ def controller_time(env, state, action, seconds: float) -> float:
     """Seconds that the controller's evaluations of one policy step take alone."""
     ctrl, n = env.controller, env.robot.n
 
-    def torques(data, placed, action):
-        obstacles = env.obstacles(data, placed)
+    def torques(data, spheres, action):
+        obstacles = env.obstacles(data, spheres)
         q, qd = data.qpos[:n], data.qvel[:n]
         setpoint = ctrl.setpoint(q, ctrl.decode(action))
 
@@ -96,7 +96,7 @@ def controller_time(env, state, action, seconds: float) -> float:
         return jax.lax.scan(substep, qd, None, length=env.n_substeps)[0]
 
     batched = jax.vmap(torques)
-    args = (state.data, state.info["placed"], action)
+    args = (state.data, state.info["spheres"], action)
     return measure(batched, *args, seconds=seconds).median
 
 

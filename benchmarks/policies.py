@@ -1,7 +1,7 @@
-"""Policies that know nothing: random actions, and a straight line to a target.
+"""Policies that learned nothing: random actions, a straight line, an adversary.
 
-A policy is a pair of pure functions of one environment: `start(key) -> state` and
-`act(state, key, to_target) -> (state, action)`, the action in [-1, 1]^12.
+A policy is a pair of pure functions of one environment: `start(key) -> memory` and
+`act(memory, key, view) -> (memory, action)`, the action in [-1, 1]^12.
 """
 
 from __future__ import annotations
@@ -20,13 +20,22 @@ MOTION = 6
 """Leading entries of an action that move the set-point; the rest are stiffnesses."""
 
 
+class View(NamedTuple):
+    """What a policy may look at."""
+
+    to_target: Array
+    """From the end effector to its target, (3,) [m]."""
+    to_obstacle: Array
+    """Unit vector from the most endangered control point to its obstacle, (3,)."""
+
+
 class Policy(NamedTuple):
     """A policy with a memory."""
 
     start: Callable[[Array], Array]
     """Its memory (12,) at the start of an episode, from a key."""
-    act: Callable[[Array, Array, Array], tuple[Array, Array]]
-    """New memory and action, from memory, key and the vector to the target [m]."""
+    act: Callable[[Array, Array, View], tuple[Array, Array]]
+    """New memory and action, from memory, key and view."""
 
 
 def stiffness(kp: float) -> float:
@@ -48,8 +57,8 @@ def smooth(correlation: float = 0.95, deviation: float = 0.7) -> Policy:
     def start(key: Array) -> Array:
         return deviation * jax.random.normal(key, (ACTION_SIZE,))
 
-    def act(memory: Array, key: Array, to_target: Array) -> tuple[Array, Array]:
-        del to_target
+    def act(memory: Array, key: Array, view: View) -> tuple[Array, Array]:
+        del view
         new = correlation * memory + noise * jax.random.normal(key, memory.shape)
         return new, jnp.clip(new, -1.0, 1.0)
 
@@ -73,8 +82,8 @@ def hard(hold: float = 20.0, least: float = 0.8, kp: float = 150.0) -> Policy:
         motion = sign * (least + (1.0 - least) * size[:MOTION])
         return jnp.concatenate([motion, low + (1.0 - low) * size[MOTION:]])
 
-    def act(memory: Array, key: Array, to_target: Array) -> tuple[Array, Array]:
-        del to_target
+    def act(memory: Array, key: Array, view: View) -> tuple[Array, Array]:
+        del view
         key_new, key_when = jax.random.split(key)
         again = jax.random.bernoulli(key_when, 1.0 / hold)
         new = jnp.where(again, start(key_new), memory)
@@ -96,18 +105,40 @@ def straight(kp: float = 150.0) -> Policy:
         del key
         return jnp.zeros(ACTION_SIZE)
 
-    def act(memory: Array, key: Array, to_target: Array) -> tuple[Array, Array]:
+    def act(memory: Array, key: Array, view: View) -> tuple[Array, Array]:
         del key
-        largest = jnp.max(jnp.abs(to_target))
-        move = to_target / jnp.maximum(largest, reach)
+        largest = jnp.max(jnp.abs(view.to_target))
+        move = view.to_target / jnp.maximum(largest, reach)
         return memory, jnp.concatenate([move, jnp.asarray(tail, move.dtype)])
 
     return Policy(start, act)
+
+
+def adversarial(hold: float = 20.0) -> Policy:
+    """Press the arm into the nearest obstacle as hard as the range allows.
+
+    The displacement points from the arm's most endangered point to the obstacle nearest
+    to it; rotations are those of the `hard` policy, every stiffness is the greatest.
+
+    Args:
+        hold: Mean number of policy steps until the rotations are drawn anew.
+    """
+    turn = hard(hold)
+
+    def act(memory: Array, key: Array, view: View) -> tuple[Array, Array]:
+        memory, _ = turn.act(memory, key, view)
+        push = view.to_obstacle
+        push = push / jnp.maximum(jnp.max(jnp.abs(push)), 1e-6)
+        stiff = jnp.ones(ACTION_SIZE - MOTION)
+        return memory, jnp.concatenate([push, memory[3:MOTION], stiff])
+
+    return Policy(turn.start, act)
 
 
 POLICIES: dict[str, Callable[[], Policy]] = {
     "smooth": smooth,
     "hard": hard,
     "straight": straight,
+    "adversarial": adversarial,
 }
 """The policies by name, with their default parameters."""

@@ -16,7 +16,8 @@ from scipy import stats
 
 import rmp_mjx as rmp
 from benchmarks.common import Row, show, write_json
-from benchmarks.safety_study import ENDING, EVENTS, LAYOUTS, Group, Study
+from benchmarks.safety_study import ENDING, EVENTS, Group, Study
+from envs.placement import LAYOUTS
 from rmp_mjx import runtime
 from rmp_mjx.rmp.leaves import (
     Barrier,
@@ -29,8 +30,11 @@ from rmp_mjx.rmp.leaves import (
 Figures = dict[str, np.ndarray]
 Make = Callable[[rmp.Robot], "rmp.RMPVICES | rmp.VICES"]
 
-REACHING_LIMIT = 100
-"""Policy steps after which a target counts as missed (5 s)."""
+REACHING_LIMIT = 300
+"""Policy steps after which an episode of four targets ends (15 s)."""
+
+NEAR = 0.05
+"""A clearance below this counts as near an obstacle [m]."""
 
 
 def _paper(robot: rmp.Robot, signs: str) -> rmp.RMPVICES:
@@ -87,7 +91,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--sim-dt", type=float, default=0.005, help="[s]")
     parser.add_argument("--armature", default="physical", help="of the Jaco 2")
     parser.add_argument(
-        "--layout", choices=LAYOUTS, default="box", help="spheres, random policies"
+        "--layout",
+        choices=tuple(LAYOUTS),
+        default="close",
+        help="spheres, random policies",
     )
     parser.add_argument(
         "--controller",
@@ -102,13 +109,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def groups(envs: int, layout: str) -> list[Group]:
-    """3/8 of the worlds for each random policy, 1/8 each to reach with and without."""
+    """2/8 of the worlds for each random policy, 1/8 to reach free or among spheres."""
     share = max(envs // 8, 1)
     return [
-        Group("smooth", layout, 3 * share, 1024),
-        Group("hard", layout, 3 * share, 1024),
-        Group("straight", None, share, REACHING_LIMIT, True),
-        Group("straight", "far", share, REACHING_LIMIT, True),
+        Group("smooth", 2 * share, layout),
+        Group("hard", 2 * share, layout),
+        Group("adversarial", 2 * share, layout),
+        Group("straight", share, None, REACHING_LIMIT),
+        Group("straight", share, "far", REACHING_LIMIT),
     ]
 
 
@@ -129,65 +137,79 @@ def safety_rows(name: str, policy: str, figures: Figures) -> list[Row]:
         rate = 1e3 * count / steps
         rows.append(Row(f"{name}_{policy}_{event}", rate, "1/1000 steps", note))
     progress = figures["moved"].sum() / figures["asked"].sum()
-    jump = figures["jump"]
+    jump, near = figures["torque_jump"], figures["clearance"] < NEAR
     worst = f"policy step's largest; worst of all {jump.max():.3g}"
+    turns = figures["turns"][near].sum() / max(near.sum(), 1) / 0.05
     for key, value, unit, note in (
         ("progress", progress, "", "moved along the commanded displacement in a step"),
         ("speed", figures["speed"].mean(), "m/s", "end effector, mean"),
-        ("saturation", figures["saturation"].mean(), "", "share of physics steps"),
+        ("saturation", figures["torque_saturation"].mean(), "", "of physics steps"),
         ("torque_jump_p99", np.quantile(jump, 0.99), "N m", worst),
         (
             "reversals",
-            figures["reversals"].mean(),
-            "1/step",
-            "physics steps in which a torque turns round by > 1 N m",
+            figures["torque_reversals"].mean(),
+            "",
+            "share of physics steps in which a torque turns round by > 1 N m",
         ),
-        ("force_peak", figures["force"].max(), "N", "worst contact"),
+        (
+            "turns_near",
+            turns,
+            "1/s",
+            f"joint velocities that change sign, nearer than {100 * NEAR:g} cm",
+        ),
+        ("force_peak", figures["contact_force_peak"].max(), "N", "worst contact"),
     ):
         rows.append(Row(f"{name}_{policy}_{key}", float(value), unit, note))
     return rows
 
 
 def reaching_rows(name: str, scene: str, figures: Figures) -> list[Row]:
-    """How many targets were reached, and how fast."""
+    """How many via points were reached, and how fast."""
     over, age = figures["over"].astype(bool), figures["age"]
     event = sum(figures[e] for e in ENDING) > 0
-    # Targets that a run's end cuts short would bias: only starts with time left count.
+    # Episodes that a run's end cuts short would bias: only starts with time left count.
     started = np.arange(len(age))[:, None] - age
-    whole = over & (started < len(age) - REACHING_LIMIT)
-    reached = whole & (figures["error"] < 0.05) & ~event
-    targets, hits = int(whole.sum()), int(reached.sum())
-    lost = int((whole & event).sum())
-    if not hits:
+    in_time = started < len(age) - REACHING_LIMIT
+    whole, solved = over & in_time, (figures["success"] > 0) & in_time
+    hits = int(figures["via_points"][in_time].sum())
+    missed, lost = int((whole & ~solved).sum()), int((whole & event).sum())
+    if not solved.any():
         return []
-    took = age[reached]
-    error = took.std(ddof=1) / np.sqrt(hits) if hits > 1 else np.inf
-    note = f"{hits} of {targets}; {lost} ended by an event"
-    spread = f"median {np.median(took):g}, standard error {error:.2g}, {hits} targets"
+    took = age[solved] / 4
+    error = took.std(ddof=1) / np.sqrt(took.size) if took.size > 1 else np.inf
+    note = f"{hits} of {hits + missed}; {lost} ended by an event"
+    spread = f"median {np.median(took):g}, standard error {error:.2g}"
     return [
-        Row(f"{name}_{scene}_reached", hits / targets, "", note),
-        Row(f"{name}_{scene}_steps", float(took.mean()), "steps", spread),
+        Row(f"{name}_{scene}_reached", hits / (hits + missed), "", note),
+        Row(f"{name}_{scene}_steps", float(took.mean()), "steps per target", spread),
     ]
 
 
 def measure_all(args: argparse.Namespace) -> Iterator[list[Row]]:
     """The rows of one controller after the other."""
     robot = rmp.Robot.load("jaco2", armature=args.armature)
-    envs, steps = (32, 120) if args.quick else (args.envs, args.steps)
+    envs, steps = (32, 320) if args.quick else (args.envs, args.steps)
     worlds = groups(envs, args.layout)
     studies: dict[type, Study] = {}
     for name in args.controller or CONTROLLERS:
         controller = CONTROLLERS[name][0](robot)
         kind = type(controller)
         if kind not in studies:
-            options = {"physics": args.physics, "sim_dt": args.sim_dt}
             studies[kind] = Study(
-                controller, worlds, steps, terminate=not args.go_on, **options
+                controller,
+                worlds,
+                steps,
+                robot=robot,
+                physics=args.physics,
+                sim_dt=args.sim_dt,
+                terminate_on_event=not args.go_on,
             )
         start = time.perf_counter()
         result = studies[kind].run(controller, args.seed)
-        smooth, hard, free, among = (result[group] for group in worlds)
-        new = safety_rows(name, "smooth", smooth) + safety_rows(name, "hard", hard)
+        *random, free, among = (result[group] for group in worlds)
+        new = []
+        for group, figures in zip(worlds, random, strict=False):
+            new += safety_rows(name, group.policy, figures)
         new += reaching_rows(name, "free", free)
         new += reaching_rows(name, "spheres", among)
         show(new, f"{name}: {CONTROLLERS[name][1]}")

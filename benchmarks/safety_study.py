@@ -1,9 +1,9 @@
-"""Drive many arms with fixed policies and record every step's safety and torques."""
+"""Drive many arms with fixed policies and record every step of every one."""
 
 from __future__ import annotations
 
 import copy
-import functools
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -14,33 +14,28 @@ from flax import struct
 from jax import Array
 
 import envs
-from benchmarks.policies import POLICIES
-from envs.base import ArmEnv
-from envs.placement import place_spheres, sample_apart
-from envs.safety import SafetyRecord, observe
-from envs.trajectory import BOX_HIGH, BOX_LOW
-from rmp_mjx import RMPVICES, VICES, Obstacles, Setpoint
-from rmp_mjx.robot.kinematics import base_point, forward_kinematics, site_pose
-from rmp_mjx.sim import PhysicsState
+from benchmarks.policies import POLICIES, View
+from envs.base import ArmEnv, State
+from envs.spheres import AWAY
+from rmp_mjx import RMPVICES, VICES
+from rmp_mjx.vec import xyz
 
 EVENTS = ("collision", "arm_collision", "self_collision", "joint_limit", "turn_limit")
-"""Events that are counted when they begin."""
+"""Events that are reported."""
 
 ENDING = ("collision", "self_collision", "joint_limit")
 """Events that end an episode."""
 
-LAYOUTS = ("box", "far", "close")
-"""Where spheres may be: anywhere in the box but 3 cm clear of the arm, or as the
-trajectory task places them around its via points, the first of which is the target."""
-
 SPHERES, RADIUS = 2, 0.05
-REACH = 0.05
-"""A target counts as reached within this distance, as in the trajectory task [m]."""
 
-REVERSAL = 1.0
-"""A torque that turns round by more than this both ways counts as a reversal [N m]."""
-
-PARTS = ("collision", "self_collision", "joint_limit", "posture", "regularizer")
+PARTS = (
+    "collision",
+    "self_collision",
+    "joint_limit",
+    "posture",
+    "attractor_weight",
+    "regularizer",
+)
 """Parts of the controller that a study may replace without compiling again."""
 
 
@@ -49,63 +44,22 @@ class Group(NamedTuple):
 
     policy: str
     """A name in `POLICIES`."""
-    layout: str | None
-    """One of `LAYOUTS`; None for no spheres."""
     worlds: int
     """How many."""
-    limit: int
+    layout: str | None = "close"
+    """Layout of the spheres; None for no spheres."""
+    limit: int = 1024
     """Policy steps after which an episode ends."""
-    reaching: bool = False
-    """Whether an episode also ends when the target is reached."""
 
 
 @struct.dataclass
 class World:
-    """One arm, its obstacles and its policy's memory."""
+    """One environment and its policy's memory."""
 
-    data: PhysicsState
-    """Physics."""
-    placed: Array
-    """Spheres that found a place, (k,) bool."""
-    target: Array
-    """Target of the end effector, (3,) [m]."""
+    state: State
+    """Environment."""
     memory: Array
     """The policy's memory."""
-    going_on: dict[str, Array]
-    """Events that the last step ended in: they are not counted again."""
-    age: Array
-    """Policy steps since the reset."""
-
-
-@struct.dataclass
-class Rules:
-    """A group's rules as numbers, so that all groups run in one program."""
-
-    policy: Array
-    """Index into `POLICIES`."""
-    layout: Array
-    """Index into `LAYOUTS`; -1 for no spheres."""
-    limit: Array
-    """Time limit in policy steps."""
-    reaching: Array
-    """Whether reaching the target ends the episode."""
-
-    @staticmethod
-    def of(groups: Sequence[Group]) -> Rules:
-        """The rules of every world, group after group."""
-        count = [g.worlds for g in groups]
-        names = tuple(POLICIES)
-        layout = [-1 if g.layout is None else LAYOUTS.index(g.layout) for g in groups]
-        return Rules(
-            policy=jnp.repeat(
-                jnp.array([names.index(g.policy) for g in groups]), np.array(count)
-            ),
-            layout=jnp.repeat(jnp.array(layout), np.array(count)),
-            limit=jnp.repeat(jnp.array([g.limit for g in groups]), np.array(count)),
-            reaching=jnp.repeat(
-                jnp.array([g.reaching for g in groups]), np.array(count)
-            ),
-        )
 
 
 class Study:
@@ -113,13 +67,12 @@ class Study:
 
     def __init__(
         self,
-        controller: RMPVICES | VICES,
+        controller: RMPVICES | VICES | str,
         groups: Sequence[Group],
         steps: int,
         *,
-        physics: str = "mujoco",
-        sim_dt: float = 0.005,
-        terminate: bool = True,
+        task: str = "trajectory",
+        **options: Any,
     ):
         """Build the scene.
 
@@ -127,20 +80,12 @@ class Study:
             controller: Kind of controller; `run` may replace its `PARTS`.
             groups: The worlds.
             steps: Policy steps of each.
-            physics: Engine, `mujoco` or `mjx`.
-            sim_dt: Physics and control timestep [s].
-            terminate: Whether an event ends an episode; a non-finite state always does.
+            task: A name in `envs.names()`.
+            **options: The task's; two spheres unless it says otherwise.
         """
-        self.groups, self.steps, self.terminate = tuple(groups), steps, terminate
-        self.env = envs.load(
-            "trajectory",
-            controller=controller,
-            physics=physics,
-            robot=controller.robot,
-            obstacles=SPHERES,
-            sphere_radius=RADIUS,
-            sim_dt=sim_dt,
-        )
+        self.groups, self.steps = tuple(groups), steps
+        options = {"obstacles": SPHERES, "sphere_radius": RADIUS} | options
+        self.env = envs.load(task, controller=controller, **options)
         self._run = jax.jit(self._simulate)
 
     def run(
@@ -161,25 +106,23 @@ class Study:
     def _simulate(self, parts: dict[str, Any], key: Array) -> dict[str, Array]:
         env = copy.copy(self.env)
         env.controller = env.controller.replace(**parts)
-        rules = Rules.of(self.groups)
-        count = rules.policy.shape[0]
-
-        def fresh(key: Array) -> World:
-            keys = jax.random.split(key, count)
-            return jax.vmap(functools.partial(reset, env))(keys, rules)
+        count = np.array([g.worlds for g in self.groups])
+        each = lambda values: np.repeat(np.array(values), count)  # noqa: E731
+        names = tuple(POLICIES)
+        policy = jnp.array(each([names.index(g.policy) for g in self.groups]))
+        limit = each([g.limit for g in self.groups])
 
         def one(worlds: World, key: Array) -> tuple[World, dict[str, Array]]:
-            key_step, key_reset = jax.random.split(key)
-            keys = jax.random.split(key_step, count)
-            advance = jax.vmap(functools.partial(step, env))
-            worlds, ended, figures = advance(worlds, keys, rules)
-            over = (worlds.age >= rules.limit) | (figures["nonfinite"] > 0)
-            over |= rules.reaching & (figures["error"] < REACH)
-            over |= ended & self.terminate
-            figures |= {"over": over, "age": worlds.age}
+            key_act, key_reset = jax.random.split(key)
+            keys = jax.random.split(key_act, len(policy))
+            worlds, figures = jax.vmap(lambda *x: _advance(env, *x))(
+                worlds, keys, policy
+            )
+            over = (worlds.state.done > 0) | (worlds.state.info["step"] >= limit)
+            figures |= {"over": over, "age": worlds.state.info["step"]}
             worlds = jax.lax.cond(
                 over.any(),
-                lambda w, key: _pick(over, fresh(key), w),
+                lambda w, key: _pick(over, self._fresh(key, policy), w),
                 lambda w, _: w,
                 worlds,
                 key_reset,
@@ -187,123 +130,90 @@ class Study:
             return worlds, figures
 
         key_start, key_run = jax.random.split(key)
-        return jax.lax.scan(
-            one, fresh(key_start), jax.random.split(key_run, self.steps)
-        )[1]
+        start = self._fresh(key_start, policy)
+        return jax.lax.scan(one, start, jax.random.split(key_run, self.steps))[1]
+
+    def _fresh(self, key: Array, policy: Array) -> World:
+        """Worlds at the start of an episode, each in its group's layout."""
+        parts = []
+        for i, group in enumerate(self.groups):
+            env = copy.copy(self.env)
+            layout = group.layout or self.env.options.layout
+            env.options = dataclasses.replace(env.options, layout=layout)
+            keys = jax.random.split(jax.random.fold_in(key, i), group.worlds)
+            state = jax.vmap(env.reset)(keys)
+            parts.append(state if group.layout else _without_spheres(state))
+        state = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        keys = jax.random.split(jax.random.fold_in(key, len(parts)), len(policy))
+
+        def memory(key: Array, policy: Array) -> Array:
+            starts = [make().start(key) for make in POLICIES.values()]
+            return jnp.stack(starts)[policy]
+
+        return World(state, jax.vmap(memory)(keys, policy))
+
+
+def _without_spheres(state: State) -> State:
+    """The same worlds, their spheres out of the way."""
+    spheres = state.info["spheres"]
+    spheres = spheres.replace(
+        placed=jnp.zeros_like(spheres.placed), velocity=0.0 * spheres.velocity
+    )
+    away = jnp.broadcast_to(jnp.array(AWAY), state.data.mocap_pos.shape)
+    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        data=state.data.replace(mocap_pos=away),  # pyright: ignore[reportAttributeAccessIssue]
+        info=state.info | {"spheres": spheres},
+    )
 
 
 def _pick(mask: Array, new: Any, old: Any) -> Any:
     def pick(n: Array, o: Array) -> Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (o.ndim - 1)), n, o).astype(
-            o.dtype
-        )
+        chosen = jnp.where(mask.reshape(mask.shape + (1,) * (o.ndim - 1)), n, o)
+        return chosen.astype(o.dtype)
 
     return jax.tree.map(pick, new, old)
 
 
-def reset(env: ArmEnv, key: Array, rules: Rules) -> World:
-    """A world near the home pose with new spheres and a new target."""
-    key_q, key_target, key_spheres, key_policy = jax.random.split(key, 4)
-    robot, n = env.robot, env.robot.n
-    q = robot.q_home + 0.02 * jax.random.normal(key_q, (n,))
-    targets, _ = sample_apart(key_target, 4, BOX_LOW, BOX_HIGH, 0.10)
-    p, R = forward_kinematics(robot, q)
-    segment = np.array(robot.points.segment)
-    offset = jnp.asarray(robot.points.offset, p.dtype)
-    arm = p[:, segment].T + jnp.einsum("ijk,kj->ki", R[:, :, segment], offset)
-    arm, radii = base_point(robot) + arm, jnp.asarray(robot.points.radius)
-
-    def place(layout: str) -> tuple[Array, Array]:
-        task, nowhere = ("close", 1e3) if layout == "box" else (layout, 0.0)
-        return place_spheres(
-            key_spheres, SPHERES, RADIUS, task, BOX_LOW, BOX_HIGH,
-            targets + nowhere, arm, radii,
-        )  # fmt: skip
-
-    options = [place(layout) for layout in LAYOUTS]
-    centers, placed = (
-        jnp.stack(column)[rules.layout] for column in zip(*options, strict=True)
-    )
-    placed &= rules.layout >= 0
-    centers = jnp.where(placed[:, None], centers, jnp.array([0.0, 0.0, -5.0]))
-    memories = jnp.stack([make().start(key_policy) for make in POLICIES.values()])
-    return World(
-        data=env.physics.init(q, jnp.zeros(n), centers),
-        placed=placed,
-        target=targets[0],
-        memory=memories[rules.policy],
-        going_on={name: jnp.zeros((), bool) for name in EVENTS},
-        age=jnp.zeros((), jnp.int32),
-    )
+def _to_target(env: ArmEnv, state: State) -> Array:
+    """From the grip to the via point it is to reach; zero in tasks without one."""
+    if "points" not in state.info:
+        return jnp.zeros(3)
+    points, reached = state.info["points"], state.info["reached"]
+    return points[jnp.minimum(reached, len(points) - 1)] - env.site(state.data).p
 
 
-def drive(
-    env: ArmEnv, data: PhysicsState, setpoint: Setpoint, obstacles: Obstacles
-) -> tuple[PhysicsState, SafetyRecord, dict[str, Array]]:
-    """Hold a set-point for one policy step.
-
-    Returns:
-        Physics, safety record, and of the torques within the step: the largest jump
-        from one physics step to the next [N m] and the number of reversals.
-    """
-    n = env.robot.n
-
-    def substep(carry, k):
-        data, record, tau, change, jump, reversals = carry
-        out = env.controller(data.qpos[:n], data.qvel[:n], setpoint, obstacles)
-        data = env.physics.step(data, out.tau)
-        now = observe(env.scene, env.robot, data, out.diagnostics["torque_scale"])
-        delta = jnp.where(k > 0, out.tau - tau, 0.0)
-        back = (delta * change < 0) & (jnp.minimum(abs(delta), abs(change)) > REVERSAL)
-        jump = jnp.maximum(jump, jnp.max(jnp.abs(delta)))
-        reversals = reversals + jnp.any(back)
-        record = record.then(now, 1.0 / env.n_substeps)
-        return (data, record, out.tau, delta, jump, reversals), None
-
-    zero = jnp.zeros(n)
-    start = (data, SafetyRecord.none(), zero, zero, jnp.zeros(()), jnp.zeros(()))
-    (data, record, *_, jump, reversals), _ = jax.lax.scan(
-        substep, start, jnp.arange(env.n_substeps)
-    )
-    return data, record, {"jump": jump, "reversals": reversals}
+def _to_obstacle(env: ArmEnv, state: State) -> Array:
+    """Unit vector from the arm's point with the least clearance to the obstacle."""
+    least, direction = jnp.inf, jnp.zeros(3)
+    for gap in env.gaps(state.data, state.info["spheres"]):
+        distance = jnp.where(gap.active, gap.distance, jnp.inf).reshape(-1)
+        normal = gap.normal.map(lambda c, d=gap.distance: jnp.broadcast_to(c, d.shape))
+        nearest = jnp.argmin(distance)
+        toward = -jnp.stack([c.reshape(-1)[nearest] for c in xyz(normal)])
+        closer = distance[nearest] < least
+        direction = jnp.where(closer, toward, direction)
+        least = jnp.minimum(least, distance[nearest])
+    return direction
 
 
-def step(
-    env: ArmEnv, world: World, key: Array, rules: Rules
-) -> tuple[World, Array, dict[str, Array]]:
-    """One policy step.
-
-    Returns:
-        The world, whether an event happened in it, and the step's figures.
-    """
-    n, ctrl = env.robot.n, env.controller
-    before, _ = site_pose(env.robot, world.data.qpos[:n])
-    acts = [
-        make().act(world.memory, key, world.target - before)
-        for make in POLICIES.values()
-    ]
-    memory, action = (
-        jnp.stack(column)[rules.policy] for column in zip(*acts, strict=True)
-    )
-    setpoint = ctrl.setpoint(world.data.qpos[:n], ctrl.decode(action))
-    obstacles = env.obstacles(world.data, world.placed)
-    data, record, figures = drive(env, world.data, setpoint, obstacles)
-    after, _ = site_pose(env.robot, data.qpos[:n])
-    bad = ~(jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.abs(data.qvel) < 1e3))
-    now = {name: getattr(record, name) for name in EVENTS}
-    begun = {name: now[name] & ~world.going_on[name] for name in EVENTS}
-    asked, moved = setpoint.p_des - before, after - before
-    figures |= {name: value.astype(jnp.float32) for name, value in begun.items()}
-    figures |= {
+def _advance(
+    env: ArmEnv, world: World, key: Array, policy: Array
+) -> tuple[World, dict[str, Array]]:
+    """One policy step: the world, and the step's figures."""
+    state = world.state
+    site = env.site(state.data)
+    view = View(_to_target(env, state), _to_obstacle(env, state))
+    acts = [make().act(world.memory, key, view) for make in POLICIES.values()]
+    memory, action = (jnp.stack(column)[policy] for column in zip(*acts, strict=True))
+    after = env.step(state, action)
+    asked = env.controller.decode(action).dpos
+    moved = env.site(after.data).p - site.p
+    figures = {
         "asked": asked @ asked,
         "moved": moved @ asked,
         "speed": jnp.linalg.norm(moved) / env.dt,
-        "saturation": record.saturation,
-        "force": record.force_peak,
+        "turns": jnp.sum(state.data.qvel * after.data.qvel < 0),
     }
-    figures = {k: jnp.where(bad, 0.0, v) for k, v in figures.items()}
-    figures["error"] = jnp.linalg.norm(world.target - after)
-    figures["nonfinite"] = bad.astype(jnp.float32)
-    world = world.replace(data=data, memory=memory, going_on=now, age=world.age + 1)
-    ended = functools.reduce(jnp.logical_or, (now[name] for name in ENDING))
-    return world, ended, figures
+    good = after.metrics["nonfinite"] == 0
+    figures = {k: jnp.where(good, v, 0.0) for k, v in figures.items()}
+    return World(after, memory), figures | after.metrics

@@ -19,7 +19,7 @@ import numpy as np
 
 import envs
 from benchmarks.common import Row, show, write_json
-from envs.safety import observe
+from envs.safety import Torques, observe
 from rmp_mjx import runtime
 from rmp_mjx.robot.kinematics import site_pose
 from rmp_mjx.sim import PhysicsState, load_physics, read_contacts
@@ -98,23 +98,24 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
     ctrl, n = env.controller, env.robot.n
 
     def policy_step(data, inputs):
-        action, placed = inputs
+        action, spheres = inputs
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
-        obstacles = env.obstacles(data, placed)
+        obstacles = env.obstacles(data, spheres)
 
         def substep(carry, _):
-            data, last, event, force, jump = carry
+            data, torques, event, force, jump = carry
             out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, obstacles)
             after = env.physics.step(data, out.tau)
-            now = observe(env.scene, env.robot, after, out.diagnostics["torque_scale"])
-            change = jnp.max(jnp.abs(out.tau - last))
-            jump = jnp.maximum(jump, jnp.nan_to_num(change))  # the first has no last
+            torques = torques.then(out.tau)
+            scale = out.diagnostics["torque_scale"]
+            now = observe(env.scene, env.robot, after, torques, scale)
+            jump = jnp.maximum(jump, now.torque_jump)
             force = jnp.maximum(force, now.force_peak)
-            return (after, out.tau, event | now.event, force, jump), None
+            return (after, torques, event | now.event, force, jump), None
 
         nothing = jnp.zeros((), bool), jnp.zeros(()), jnp.zeros(())
-        start = (data, jnp.full(n, jnp.nan), *nothing)
-        (after, tau, event, force, jump), _ = jax.lax.scan(
+        start = (data, Torques.none(n), *nothing)
+        (after, torques, event, force, jump), _ = jax.lax.scan(
             substep, start, None, length=env.n_substeps
         )
         row = {
@@ -123,12 +124,12 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
             "force": force,
             "jump": jump,
             "state": after,
-            "tau": tau,
+            "tau": torques.tau,
         }
         return after, row
 
     def step(data, action):
-        return jax.vmap(policy_step)(data, (action, starts.info["placed"]))
+        return jax.vmap(policy_step)(data, (action, starts.info["spheres"]))
 
     return jax.lax.scan(step, starts.data, actions)[1]
 

@@ -1,40 +1,94 @@
-"""What all tasks share: the state, the policy step, the safety record."""
+"""What all tasks share: the state, the policy step, events and their record."""
 
 from __future__ import annotations
 
 import abc
-from typing import Any
+import functools
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from envs.safety import SafetyRecord, observe
-from envs.scene import TABLE_HEIGHT, Scene
+from envs import options
+from envs.placement import place_spheres
+from envs.safety import SafetyRecord, Torques, observe
+from envs.scene import TABLE_HEIGHT, Contacts, build_scene, no_objects
+from envs.spheres import AWAY, Spheres
 from rmp_mjx.control import ACTION_SIZE, RMPVICES, VICES
-from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.obstacles import Gap, Obstacles
 from rmp_mjx.robot import Robot
+from rmp_mjx.robot.kinematics import (
+    SiteState,
+    arm_state,
+    base_point,
+    forward_kinematics,
+    site_state,
+)
 from rmp_mjx.sim import PhysicsState, load_physics
 from rmp_mjx.types import Setpoint
+from rmp_mjx.vec import Vec
 
-CONTROLLERS = {"rmp_vices": RMPVICES, "vices": VICES}
-"""Controllers by name."""
-
-SAFETY_METRICS = {
+METRICS = {
+    "success": "max",
     "collision": "sum",
     "arm_collision": "sum",
+    "obstacle_collision": "sum",
     "self_collision": "sum",
     "joint_limit": "sum",
     "turn_limit": "sum",
     "contact_force": "mean",
     "contact_force_peak": "max",
+    "contact_impulse": "sum",
+    "work_force": "mean",
+    "work_force_peak": "max",
+    "clearance": "min",
     "torque_saturation": "mean",
+    "torque_jump": "max",
+    "torque_reversals": "mean",
     "tracking_error": "mean",
+    "unplaced_obstacles": "max",
+    "contact_overflow": "max",
     "nonfinite": "max",
 }
-"""Metrics of every task and how a step's value folds into the episode's."""
+"""Metrics of every task and how a step's value folds into the episode's.
+
+Events (`sum`) count when they begin. Forces are normal forces of collisions [N], their
+impulse is in N s; `work_force` is the hand's on what it works with. `clearance` is the
+least distance of a control point to the table, a fixture or a sphere [m], at the end of
+each policy step. `torque_jump` is the largest change of a torque between two physics
+steps of a policy step [N m], `torque_reversals` the share of physics steps in which a
+torque turns round: what an oscillation does.
+"""
+
+
+SHARED = ("rng", "step", "spheres", "going_on")
+"""Keys of `State.info` that every task has; the others are the task's own."""
+
+
+class Entry(NamedTuple):
+    """One group of numbers of an observation."""
+
+    name: str
+    """Name."""
+    size: int
+    """How many numbers."""
+    unit: str
+    """Unit; `-` if none."""
+    meaning: str
+    """What they say."""
+
+
+ARM_ENTRIES = (
+    Entry("position", 3, "m", "grip site in the arm's base frame"),
+    Entry("rotation", 9, "-", "its rotation matrix, row by row"),
+    Entry("velocity", 3, "m/s", "its velocity"),
+    Entry("angular_velocity", 3, "rad/s", "its angular velocity"),
+)
+"""What every observation begins with."""
 
 
 @struct.dataclass
@@ -55,123 +109,324 @@ class State:
     """What the task carries along; the keys never change."""
 
 
+class Score(NamedTuple):
+    """A task's verdict on one policy step."""
+
+    task: dict[str, Array]
+    """The task's part of `State.info`, brought up to date."""
+    reward: Array
+    """Reward, events not counted."""
+    success: Array
+    """Whether the task is solved in this step."""
+    metrics: dict[str, Array]
+    """The task's own metrics."""
+
+
 class ArmEnv(abc.ABC):
     """An arm under a controller, driven by a policy at 20 Hz.
 
-    `reset` and `step` are pure functions of one environment; callers vmap them.
+    `reset` and `step` are pure functions of one environment; callers vmap them. A task
+    says what its scene, start, score and observation are.
     """
 
-    dt = 0.05
+    dt = options.CTRL_DT
     """Seconds per policy step."""
     action_size = ACTION_SIZE
     """Entries of an action in [-1, 1]."""
     episode_length = 1024
     """Policy steps until the time limit, which the caller enforces."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        controller: str | RMPVICES | VICES,
-        physics: str,
-        scene: Scene,
-        sim_dt: float,
-        event_penalty: float,
-        terminate_on_event: bool,
-    ):
-        """Put the pieces together; see `envs.load` for the options."""
-        self.robot = robot
+    Options: ClassVar[type[options.Options]] = options.Options
+    """The task's options."""
+    name: ClassVar[str]
+    """The task's name."""
+    q_start: ClassVar[np.ndarray]
+    """Start configuration of the Jaco 2, (7,) [rad]."""
+    sphere_box: ClassVar[tuple[np.ndarray, np.ndarray]]
+    """Corners of the box for the spheres' centres [m]."""
+    task_metrics: ClassVar[dict[str, str]] = {}
+    """The task's own metrics and their reductions."""
+    fixture_slots: ClassVar[dict[str, int]] = {}
+    """Obstacle slots that `fixtures` fills, by kind, besides the table's plane."""
+
+    def __init__(self, asked: options.Options):
+        """Put the pieces together."""
+        self.options = asked
+        robot = asked.robot
+        if robot is None:
+            # The posture leaf rests where the task starts.
+            robot = Robot.load("jaco2", armature=asked.armature)
+            robot = robot.replace(q_home=self.q_start)  # pyright: ignore[reportAttributeAccessIssue]
+        controller = asked.controller
         if isinstance(controller, str):
-            if controller not in CONTROLLERS:
-                raise ValueError(
-                    f"unknown controller '{controller}'; valid names: "
-                    f"{', '.join(CONTROLLERS)}"
-                )
-            controller = CONTROLLERS[controller](robot)
+            controller = options.CONTROLLERS[controller](robot)
+        self.robot: Robot = robot
         self.controller: RMPVICES | VICES = controller
-        self.scene = scene
-        self.physics = load_physics(physics, scene.model)
-        self.sim_dt = sim_dt
-        self.n_substeps = substeps(self.dt, sim_dt)
-        self.event_penalty = event_penalty
-        self.terminate_on_event = terminate_on_event
-        self.metric_reductions = SAFETY_METRICS | self.task_metrics
-
-    @property
-    @abc.abstractmethod
-    def task_metrics(self) -> dict[str, str]:
-        """The task's own metrics and their reductions."""
-
-    @property
-    @abc.abstractmethod
-    def observation_size(self) -> int:
-        """Entries of an observation."""
-
-    @abc.abstractmethod
-    def reset(self, rng: Array) -> State:
-        """Start an episode."""
-
-    @abc.abstractmethod
-    def step(self, state: State, action: Float[Array, " 12"]) -> State:
-        """One policy step."""
-
-    def obstacles(self, data: PhysicsState, active: Array) -> Obstacles:
-        """The table and the scene's spheres, as the controller sees them."""
-        table = np.array([[0.0, 0.0, TABLE_HEIGHT]])
-        slots = Obstacles.empty(spheres=self.scene.spheres, planes=1).with_planes(
-            table, np.array([[0.0, 0.0, 1.0]])
+        self.scene = build_scene(
+            robot,
+            asked.sim_dt,
+            asked.obstacles,
+            asked.sphere_radius,
+            asked.cone,
+            self.objects,
         )
+        self.physics = load_physics(asked.physics, self.scene.model)
+        self.sim_dt = asked.sim_dt
+        self.n_substeps = options.substeps(asked.sim_dt)
+        self.metric_reductions = METRICS | self.task_metrics
+
+    # What a task says.
+
+    @property
+    @abc.abstractmethod
+    def task_entries(self) -> tuple[Entry, ...]:
+        """The task's part of the observation."""
+
+    @abc.abstractmethod
+    def begin(
+        self, rng: Array, q: Float[Array, " n"]
+    ) -> tuple[Array, dict[str, Array]]:
+        """Positions of the objects' joints, and the task's part of `State.info`."""
+
+    @abc.abstractmethod
+    def score(
+        self,
+        data: PhysicsState,
+        site: SiteState,
+        record: SafetyRecord,
+        task: dict[str, Array],
+        step: Array,
+    ) -> Score:
+        """Judge the policy step that led to `data`; `step` counts it."""
+
+    @abc.abstractmethod
+    def observe(
+        self, data: PhysicsState, site: SiteState, task: dict[str, Array]
+    ) -> dict[str, Array]:
+        """The task's part of the observation, an array for each of `task_entries`."""
+
+    @abc.abstractmethod
+    def keep_clear(self, task: dict[str, Array]) -> Float[Array, "v 3"]:
+        """Points that the spheres' layout keeps clear [m]."""
+
+    def objects(self, spec: mujoco.MjSpec) -> Contacts:
+        """Add the task's objects to the scene."""
+        return no_objects(spec)
+
+    def fixtures(self, slots: Obstacles, data: PhysicsState) -> Obstacles:
+        """Fill in the fixtures that the tree avoids besides the table."""
+        del data
+        return slots
+
+    # What all tasks share.
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """The observation, entry by entry."""
+        return ARM_ENTRIES + self.task_entries
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers in an observation."""
+        return sum(entry.size for entry in self.entries)
+
+    def reset(self, rng: Array) -> State:
+        """Start near the start configuration, everything random drawn anew."""
+        rng, key_q, key_task, key_spheres, key_motion = jax.random.split(rng, 5)
+        model, n = self.scene.model, self.robot.n
+        q = jnp.asarray(self.robot.q_home, jnp.float32)
+        q = q + self.options.start_noise * jax.random.normal(key_q, (n,))
+        objects, task = self.begin(key_task, q)
+        centers, placed = self._place(key_spheres, q, task)
+        spheres = Spheres.start(key_motion, placed, self.options.obstacle_speed)
+        data = self.physics.init(
+            jnp.concatenate([q, objects]), jnp.zeros(model.nv), centers
+        )
+        going_on = {name: jnp.zeros((), bool) for name in SafetyRecord.none().flags}
+        info = {
+            "rng": rng,
+            "step": jnp.zeros((), jnp.int32),
+            "spheres": spheres,
+            "going_on": going_on,
+        }
+        return State(
+            data=data,
+            obs=self._observation(data, self.site(data), task),
+            reward=jnp.zeros(()),
+            done=jnp.zeros(()),
+            metrics={name: jnp.zeros(()) for name in self.metric_reductions},
+            info=info | task,
+        )
+
+    def step(self, state: State, action: Float[Array, " 12"]) -> State:
+        """Hold the action for one policy step and score where it led."""
+        asked, info = self.options, state.info
+        rng, key = jax.random.split(info["rng"])
+        error = asked.obstacle_noise * jax.random.normal(key, (self.scene.spheres, 3))
+        data, spheres, setpoint, record = self.drive(
+            state.data, info["spheres"], action, error
+        )
+        step = info["step"] + 1
+        task = {name: value for name, value in info.items() if name not in SHARED}
+        site = self.site(data)
+        score = self.score(data, site, record, task, step)
+        obs = self._observation(data, site, score.task)
+        bad = ~(jnp.all(jnp.isfinite(obs)) & jnp.all(jnp.abs(data.qvel) < 1e3))
+        reward = score.reward - jnp.where(record.event, asked.event_penalty, 0.0)
+        done = score.success & asked.terminate_on_success
+        done |= record.event & asked.terminate_on_event
+        metrics = self._events(record, info["going_on"])
+        metrics |= {
+            "success": score.success,
+            "contact_force": record.force,
+            "contact_force_peak": record.force_peak,
+            "contact_impulse": record.force * self.dt,
+            "work_force": record.work_force,
+            "work_force_peak": record.work_force_peak,
+            "clearance": self.clearance(data, spheres),
+            "torque_saturation": record.saturation,
+            "torque_jump": record.torque_jump,
+            "torque_reversals": record.reversals,
+            "tracking_error": jnp.linalg.norm(setpoint.p_des - site.p),
+            "unplaced_obstacles": jnp.sum(~spheres.placed),
+            "contact_overflow": record.overflow,
+            "nonfinite": bad,
+        }
+        metrics |= score.metrics
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            data=data,
+            obs=jnp.where(bad, 0.0, obs),
+            reward=jnp.where(bad, 0.0, reward),
+            done=(done | bad).astype(jnp.float32),
+            metrics={
+                k: jnp.nan_to_num(jnp.asarray(v, jnp.float32))
+                for k, v in metrics.items()
+            },
+            info=info
+            | {"rng": rng, "step": step, "spheres": spheres, "going_on": record.flags}
+            | score.task,
+        )
+
+    def obstacles(
+        self, data: PhysicsState, spheres: Spheres, error: Array | float = 0.0
+    ) -> Obstacles:
+        """Table, fixtures and spheres, as the controller is told of them.
+
+        Args:
+            data: Physics.
+            spheres: The spheres.
+            error: Error of the spheres' measured positions, (k, 3) [m].
+        """
+        table = np.array([[0.0, 0.0, TABLE_HEIGHT]])
+        slots = Obstacles.empty(
+            spheres=self.scene.spheres, planes=1, **self.fixture_slots
+        ).with_planes(table, np.array([[0.0, 0.0, 1.0]]))
+        slots = self.fixtures(slots, data)
         if not self.scene.spheres:
             return slots
-        radius = self.scene.model.geom("sphere_0").size[0]
-        slots = slots.with_spheres(data.mocap_pos, np.full(self.scene.spheres, radius))
-        spheres = slots.spheres.replace(active=active)
-        return slots.replace(spheres=spheres)
+        asked = self.options
+        return spheres.perceive(
+            slots, data.mocap_pos, asked.sphere_radius, error, asked.obstacle_delay
+        )
 
     def drive(
-        self, data: PhysicsState, action: Float[Array, " 12"], obstacles: Obstacles
-    ) -> tuple[PhysicsState, Setpoint, SafetyRecord]:
+        self,
+        data: PhysicsState,
+        spheres: Spheres,
+        action: Float[Array, " 12"],
+        error: Array | float = 0.0,
+    ) -> tuple[PhysicsState, Spheres, Setpoint, SafetyRecord]:
         """Hold one action for a policy step; the tree runs at every physics step."""
         ctrl, n = self.controller, self.robot.n
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
 
         def substep(carry, _):
-            data, record = carry
-            out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, obstacles)
+            data, spheres, torques, record = carry
+            seen = self.obstacles(data, spheres, error)
+            out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, seen)
+            if self.options.obstacle_speed and self.scene.spheres:
+                centers, spheres = spheres.move(
+                    data.mocap_pos, self.sim_dt, *self.sphere_box
+                )
+                data = data.replace(mocap_pos=centers)
             data = self.physics.step(data, out.tau)
-            now = observe(self.scene, self.robot, data, out.diagnostics["torque_scale"])
-            return (data, record.then(now, 1.0 / self.n_substeps)), None
+            now = observe(
+                self.scene,
+                self.robot,
+                data,
+                torques := torques.then(out.tau),
+                out.diagnostics["torque_scale"],
+            )
+            record = record.then(now, 1.0 / self.n_substeps)
+            return (data, spheres, torques, record), None
 
-        start = (data, SafetyRecord.none())
-        (data, record), _ = jax.lax.scan(substep, start, None, length=self.n_substeps)
-        return data, setpoint, record
+        start = (data, spheres, Torques.none(n), SafetyRecord.none())
+        (data, spheres, _, record), _ = jax.lax.scan(
+            substep, start, None, length=self.n_substeps
+        )
+        return data, spheres, setpoint, record
 
-    def safety_metrics(
-        self, record: SafetyRecord, tracking_error: Array, bad: Array
-    ) -> dict[str, Array]:
-        """The step's values of `SAFETY_METRICS`."""
-        return {
-            "collision": record.collision.astype(jnp.float32),
-            "arm_collision": record.arm_collision.astype(jnp.float32),
-            "self_collision": record.self_collision.astype(jnp.float32),
-            "joint_limit": record.joint_limit.astype(jnp.float32),
-            "turn_limit": record.turn_limit.astype(jnp.float32),
-            "contact_force": record.force,
-            "contact_force_peak": record.force_peak,
-            "torque_saturation": record.saturation,
-            "tracking_error": tracking_error,
-            "nonfinite": bad.astype(jnp.float32),
+    def site(self, data: PhysicsState) -> SiteState:
+        """Pose and velocity of the grip site."""
+        n = self.robot.n
+        return site_state(
+            self.robot, arm_state(self.robot, data.qpos[:n], data.qvel[:n])
+        )
+
+    def gaps(self, data: PhysicsState, spheres: Spheres) -> list[Gap]:
+        """Distances of all control points to what the tree avoids, kind by kind."""
+        x = Vec.of(self._arm_points(data.qpos[: self.robot.n]), 1)
+        rest = x.map(jnp.zeros_like)
+        rho = jnp.asarray(self.robot.points.radius, data.qpos.dtype)
+        return [k.gap(x, rest, rho) for k in self.obstacles(data, spheres).kinds]
+
+    def clearance(self, data: PhysicsState, spheres: Spheres) -> Float[Array, ""]:
+        """Least distance of a control point to what the tree avoids [m]."""
+        nearest = (
+            jnp.min(jnp.where(gap.active, gap.distance, jnp.inf))
+            for gap in self.gaps(data, spheres)
+        )
+        return functools.reduce(jnp.minimum, nearest)
+
+    def _arm_points(self, q: Float[Array, " n"]) -> Float[Array, "p 3"]:
+        """Control points of the arm in the world frame [m]."""
+        p, R = forward_kinematics(self.robot, q)
+        segment = np.array(self.robot.points.segment)
+        offset = jnp.asarray(self.robot.points.offset, p.dtype)
+        arm = p[:, segment].T + jnp.einsum("ijk,kj->ki", R[:, :, segment], offset)
+        return base_point(self.robot) + arm
+
+    def _place(
+        self, rng: Array, q: Array, task: dict[str, Array]
+    ) -> tuple[Array, Array]:
+        """Sphere centres and which found a place; the others wait far below."""
+        centers, placed = place_spheres(
+            rng,
+            self.scene.spheres,
+            self.options.sphere_radius,
+            self.options.layout,
+            *self.sphere_box,
+            self.keep_clear(task),
+            self._arm_points(q),
+            jnp.asarray(self.robot.points.radius),
+        )
+        return jnp.where(placed[:, None], centers, jnp.array(AWAY)), placed
+
+    def _observation(
+        self, data: PhysicsState, site: SiteState, task: dict[str, Array]
+    ) -> Array:
+        """All entries in one vector."""
+        values = {
+            "position": site.p,
+            "rotation": site.R,
+            "velocity": site.v,
+            "angular_velocity": site.w,
         }
+        values |= self.observe(data, site, task)
+        return jnp.concatenate([values[e.name].reshape(-1) for e in self.entries])
 
-
-def substeps(dt: float, sim_dt: float) -> int:
-    """Physics steps per policy step.
-
-    Raises:
-        ValueError: The timestep is not positive or does not divide the policy step.
-    """
-    if not (np.isfinite(sim_dt) and 0 < sim_dt <= dt):
-        raise ValueError(f"sim_dt must be in (0, {dt}] s, got {sim_dt}")
-    n = round(dt / sim_dt)
-    if abs(n * sim_dt - dt) > 1e-9:
-        raise ValueError(f"sim_dt={sim_dt} s does not divide the policy step of {dt} s")
-    return n
+    def _events(
+        self, record: SafetyRecord, going_on: dict[str, Array]
+    ) -> dict[str, Array]:
+        """Which events began in this step."""
+        return {name: on & ~going_on[name] for name, on in record.flags.items()}

@@ -1,7 +1,8 @@
-"""Build the MuJoCo scene of a task: arena, arm, obstacles, watched contact pairs."""
+"""Build the MuJoCo scene of a task: arena, arm, objects, spheres, contact pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -9,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from rmp_mjx.robot import Robot
-from rmp_mjx.sim import watch_pairs
+from rmp_mjx.sim import add_pairs
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -19,8 +20,21 @@ TABLE_HEIGHT = -0.112
 ARM = "arm/"
 """Prefix of the arm's names in a scene."""
 
-HAND_BODIES = (ARM + "link_7", ARM + "fingers")
-"""Bodies that count as the hand in the safety record."""
+
+@struct.dataclass
+class Contacts:
+    """Geoms of a task's objects that take part in contact, by name (all static)."""
+
+    fixtures: tuple[str, ...] = struct.field(pytree_node=False, default=())
+    """Geoms that no part of the arm may touch."""
+    work: tuple[str, ...] = struct.field(pytree_node=False, default=())
+    """Geoms that the hand works with, and nothing else of the arm may touch."""
+    work_friction: float = struct.field(pytree_node=False, default=0.5)
+    """Sliding friction of the hand on them."""
+    passive: tuple[tuple[str, str, float], ...] = struct.field(
+        pytree_node=False, default=()
+    )
+    """Contacts without the arm: two geoms and their sliding friction."""
 
 
 @struct.dataclass
@@ -28,59 +42,101 @@ class Scene:
     """A compiled scene and what its watched contact pairs mean (all static)."""
 
     model: mujoco.MjModel = struct.field(pytree_node=False)
-    """The scene."""
+    """The scene; the arm's joints come first."""
     hand: np.ndarray = struct.field(pytree_node=False)
-    """Pairs of the hand with the environment, (pairs,) bool."""
+    """Pairs of the hand with what it must not touch, (pairs,) bool."""
     arm: np.ndarray = struct.field(pytree_node=False)
-    """Pairs of any other link with the environment."""
+    """Pairs of any other link with anything but the arm."""
+    obstacle: np.ndarray = struct.field(pytree_node=False)
+    """Those of the hand's and the arm's pairs that are with a sphere."""
     own: np.ndarray = struct.field(pytree_node=False)
     """Pairs of two links of the arm."""
+    work: np.ndarray = struct.field(pytree_node=False)
+    """Pairs of the hand with what it works on."""
     spheres: int = struct.field(pytree_node=False)
     """Obstacle spheres (mocap bodies, in order)."""
 
 
-def build_scene(
-    robot: Robot, sim_dt: float, spheres: int, sphere_radius: float
-) -> Scene:
-    """Compile the arm on its table with obstacle spheres.
+def no_objects(spec: mujoco.MjSpec) -> Contacts:
+    """A task with nothing but the table."""
+    del spec
+    return Contacts()
 
-    Contact is explicit: table with every link that can reach it, spheres with every
-    moving link, and the links that can touch each other. These contacts are
-    frictionless: none of them is meant to happen, and their normal force is what the
-    safety record reads.
+
+def build_scene(
+    robot: Robot,
+    sim_dt: float,
+    spheres: int = 0,
+    sphere_radius: float = 0.05,
+    cone: str = "pyramidal",
+    objects: Callable[[mujoco.MjSpec], Contacts] = no_objects,
+) -> Scene:
+    """Compile the arm on its table with the task's objects and obstacle spheres.
+
+    Contact is explicit: the table with every link that can reach it; fixtures, objects
+    and spheres with every moving link; and the links that can touch each other. Contact
+    that is not meant to happen is frictionless: its normal force is what the safety
+    record reads.
+
+    Args:
+        robot: The arm.
+        sim_dt: Timestep [s].
+        spheres: Number of obstacle spheres.
+        sphere_radius: Their radius [m].
+        cone: Friction cone, `pyramidal` or `elliptic`.
+        objects: Adds the task's objects and says which geoms matter.
     """
     spec = mujoco.MjSpec.from_file(str(ASSETS / "arena.xml"))
     spec.option.timestep = sim_dt
+    spec.option.cone = int(cone == "elliptic")
     arm = mujoco.MjSpec.from_string(robot.mjcf)
     arm.option.timestep = sim_dt  # else attaching warns of a conflict
     for key in list(arm.keys):
         arm.delete(key)
     spec.attach(arm, prefix=ARM, frame=spec.worldbody.add_frame())
-    for i in range(spheres):
-        body = spec.worldbody.add_body(name=f"sphere_{i}", mocap=True, pos=[0, 0, -5])
-        body.add_geom(
-            name=f"sphere_{i}",
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[sphere_radius, 0, 0],
-            rgba=[0.85, 0.2, 0.15, 1],
-        )
-    capsules = robot.capsules
-    geoms = [ARM + name for name in capsules.geom]
-    moving = [g for g, k in zip(geoms, capsules.segment, strict=True) if k >= 0]
-    pairs = [
-        (g, "table") for g, k in zip(geoms, capsules.segment, strict=True) if k >= 1
-    ]
-    pairs += [(g, f"sphere_{i}") for i in range(spheres) for g in moving]
-    own = [(geoms[a], geoms[b]) for a, b in capsules.pairs]
-    watch_pairs(spec, pairs + own, condim=1)
-    model = spec.compile()
-    bodies = [model.body(model.geom(g).bodyid[0]).name for g, _ in pairs + own]
-    with_world = np.array([True] * len(pairs) + [False] * len(own))
-    of_hand = np.array([b in HAND_BODIES for b in bodies])
+    contacts = objects(spec)
+    balls = [_add_sphere(spec, i, sphere_radius) for i in range(spheres)]
+
+    capsules, last = robot.capsules, robot.n - 1
+    links = [(ARM + g, k) for g, k in zip(capsules.geom, capsules.segment, strict=True)]
+    moving = [(g, k) for g, k in links if k >= 0]
+    forbidden = [(g, k, "table") for g, k in links if k >= 1]
+    forbidden += [(g, k, x) for x in contacts.fixtures for g, k in moving]
+    forbidden += [(g, k, x) for x in contacts.work for g, k in moving if k < last]
+    on_spheres = [(g, k, x) for x in balls for g, k in moving]
+    own = [(links[a][0], links[b][0]) for a, b in capsules.pairs]
+    work = [(g, x) for x in contacts.work for g, k in moving if k == last]
+
+    world = forbidden + on_spheres
+    add_pairs(spec, [(g, x) for g, _, x in world] + own)
+    add_pairs(spec, work, friction=contacts.work_friction)
+    for a, b, friction in contacts.passive:
+        add_pairs(spec, [(a, b)], friction=friction, watched=False)
+
+    of_hand = np.array([k == last for _, k, _ in world], bool)
+    groups = [len(forbidden), len(on_spheres), len(own), len(work)]
+    is_forbidden, is_sphere, is_own, is_work = (
+        np.repeat(np.arange(4), groups) == i for i in range(4)
+    )
+    hand = np.concatenate([of_hand, np.zeros(len(own) + len(work), bool)])
     return Scene(
-        model=model,
-        hand=with_world & of_hand,
-        arm=with_world & ~of_hand,
-        own=~with_world,
+        model=spec.compile(),
+        hand=hand,
+        arm=(is_forbidden | is_sphere) & ~hand,
+        obstacle=is_sphere,
+        own=is_own,
+        work=is_work,
         spheres=spheres,
     )
+
+
+def _add_sphere(spec: mujoco.MjSpec, i: int, radius: float) -> str:
+    name = f"sphere_{i}"
+    body = spec.worldbody.add_body(name=name, mocap=True, pos=[0, 0, -5])
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[radius, 0, 0],
+        rgba=[0.85, 0.2, 0.15, 1],
+    )
+    return name

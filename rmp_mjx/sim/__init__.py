@@ -9,8 +9,8 @@ from rmp_mjx.sim.base import Contacts as Contacts
 from rmp_mjx.sim.base import Physics as Physics
 from rmp_mjx.sim.base import PhysicsError as PhysicsError
 from rmp_mjx.sim.base import PhysicsState as PhysicsState
+from rmp_mjx.sim.base import add_pairs as add_pairs
 from rmp_mjx.sim.base import read_contacts as read_contacts
-from rmp_mjx.sim.base import watch_pairs as watch_pairs
 from rmp_mjx.sim.mjx import MjxPhysics
 from rmp_mjx.sim.mujoco_c import MujocoPhysics
 

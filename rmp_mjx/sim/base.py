@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import jax.numpy as jnp
@@ -52,6 +53,8 @@ class Contacts:
     """Whether the pair's surfaces overlap."""
     force: Float[Array, " pairs"]
     """Sum of the pair's normal forces [N]."""
+    overflow: Bool[Array, " pairs"]
+    """Whether the pair has more contacts than the sensor reports."""
 
 
 class Physics(Protocol):
@@ -86,18 +89,29 @@ def init_state(
     )
 
 
-def watch_pairs(spec: mujoco.MjSpec, pairs: list[tuple[str, str]], condim: int) -> None:
-    """Make contact explicit: only these geom pairs collide, each with its sensor.
+def add_pairs(
+    spec: mujoco.MjSpec,
+    pairs: Sequence[tuple[str, str]],
+    *,
+    friction: float = 0.0,
+    watched: bool = True,
+) -> None:
+    """Make contact explicit: of all geoms only the pairs given here collide.
 
     Args:
-        spec: Scene to edit. All its geoms stop colliding by type.
+        spec: Scene to edit; call once for each kind of contact.
         pairs: Geom names.
-        condim: 1 for frictionless contact, 3 for friction.
+        friction: Sliding friction coefficient; 0 makes the contact frictionless.
+        watched: Whether each pair gets a sensor, for `read_contacts`.
     """
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     for a, b in pairs:
-        spec.add_pair(name=f"{a}/{b}", geomname1=a, geomname2=b, condim=condim)
+        pair = spec.add_pair(name=f"{a}/{b}", geomname1=a, geomname2=b)
+        pair.condim = 3 if friction else 1
+        pair.friction = [friction or 1.0, friction or 1.0, 0.005, 0.0001, 0.0001]
+        if not watched:
+            continue
         sensor = spec.add_sensor(name=f"{PAIR_SENSOR}{a}/{b}")
         sensor.type = mujoco.mjtSensor.mjSENS_CONTACT
         sensor.objtype = sensor.reftype = mujoco.mjtObj.mjOBJ_GEOM
@@ -108,13 +122,14 @@ def watch_pairs(spec: mujoco.MjSpec, pairs: list[tuple[str, str]], condim: int) 
 
 
 def read_contacts(model: mujoco.MjModel, state: PhysicsState) -> Contacts:
-    """Contacts of the watched pairs, in the order given to `watch_pairs`."""
+    """Contacts of the watched pairs, in the order given to `add_pairs`."""
     rows = state.sensors[_address(model).reshape(-1)]
     rows = rows.reshape(-1, CONTACTS_PER_PAIR, _WIDTH)
     touching = (rows[..., 0] > 0) & (rows[..., 4] < 0)
     return Contacts(
         touching=jnp.any(touching, axis=1),
         force=jnp.sum(jnp.where(touching, rows[..., 1], 0.0), axis=1),
+        overflow=rows[:, 0, 0] > CONTACTS_PER_PAIR,
     )
 
 
@@ -127,7 +142,7 @@ def sensor_rows(
     """Sensor data with each pair's contact in its first slot; other sensors are 0.
 
     Args:
-        model: Scene made with `watch_pairs`.
+        model: Scene made with `add_pairs`.
         found: Number of contacts of each pair.
         force: Sum of their normal forces [N].
         dist: Signed distance [m].
@@ -139,7 +154,7 @@ def sensor_rows(
 
 
 def pair_sensors(model: mujoco.MjModel) -> list[int]:
-    """Ids of the sensors that `watch_pairs` made, in order."""
+    """Ids of the sensors that `add_pairs` made, in order."""
     names = (model.sensor(s).name for s in range(model.nsensor))
     return [s for s, name in enumerate(names) if name.startswith(PAIR_SENSOR)]
 

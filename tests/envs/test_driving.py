@@ -25,7 +25,7 @@ def start(quiet, arm):
     placed = np.zeros((LANES, 2), bool)
     placed[SPHERE, 0] = True
     data = quiet.data.replace(mocap_pos=jnp.asarray(mocap))
-    info = quiet.info | {"placed": jnp.asarray(placed)}
+    info = quiet.info | {"spheres": quiet.info["spheres"].replace(placed=placed)}
     return quiet.replace(data=data, info=info)
 
 
@@ -82,7 +82,7 @@ def test_an_arm_that_is_not_pushed_stays(which, request, arm, start):
 def test_the_tree_sees_the_spheres_and_the_table_of_the_physics(make, start):
     env = make("rmp_vices").env
     lane = jax.tree.map(lambda x: x[SPHERE], start)
-    seen = env.obstacles(lane.data, lane.info["placed"])
+    seen = env.obstacles(lane.data, lane.info["spheres"])
     np.testing.assert_array_equal(seen.spheres.center, lane.data.mocap_pos)
     np.testing.assert_array_equal(seen.spheres.active, [True, False])
     model = env.scene.model
@@ -101,7 +101,7 @@ def test_clearance_of_the_tree_is_mujocos_distance(make, start, arm):
     env = make("rmp_vices").env
     lane = jax.tree.map(lambda x: x[SPHERE], start)
     q, qd = lane.data.qpos, lane.data.qvel
-    obstacles = env.obstacles(lane.data, lane.info["placed"])
+    obstacles = env.obstacles(lane.data, lane.info["spheres"])
     setpoint = env.controller.setpoint(q, env.controller.decode(jnp.zeros(12)))
     out = jax.jit(env.controller.__call__)(q, qd, setpoint, obstacles)
     model, data = env.scene.model, arm.data

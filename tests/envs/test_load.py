@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import SAFETY_METRICS, substeps
+from envs.base import METRICS
+from envs.options import substeps
 
 
 def test_an_unknown_task_lists_the_tasks_and_suggests_one():
@@ -22,7 +23,7 @@ def test_an_unknown_task_lists_the_tasks_and_suggests_one():
         ({"observation": "image"}, "'image'.*rotated, fixed"),
         ({"armature": "none"}, "'none'.*physical, robosuite"),
         ({"obstacles": -1}, "obstacles must be at least 0"),
-        ({"sphere_radius": 0.0}, "sphere_radius positive"),
+        ({"sphere_radius": 0.0}, "sphere_radius must be positive"),
         ({"sim_dt": 0.004}, "0.004 s does not divide the policy step of 0.05 s"),
         ({"sim_dt": 0.0}, "sim_dt must be in"),
         ({"sim_dt": -0.005}, "sim_dt must be in"),
@@ -38,7 +39,7 @@ def test_a_wrong_option_is_refused_with_the_valid_ones(options, message):
 
 @pytest.mark.parametrize("sim_dt", [0.001, 0.002, 0.0025, 0.005, 0.01, 0.05])
 def test_a_policy_step_lasts_its_physics_steps(sim_dt):
-    n = substeps(0.05, sim_dt)
+    n = substeps(sim_dt)
     assert n * sim_dt == pytest.approx(0.05, abs=1e-12)
 
 
@@ -51,9 +52,9 @@ def test_the_physics_steps_by_the_chosen_timestep():
 
 def test_every_metric_says_how_it_folds_into_an_episode():
     env = envs.load("trajectory", physics="mujoco")
-    assert SAFETY_METRICS.items() <= env.metric_reductions.items()
+    assert METRICS.items() <= env.metric_reductions.items()
     assert {"via_points", "success"} <= env.metric_reductions.keys()
-    assert set(env.metric_reductions.values()) <= {"sum", "max", "mean", "last"}
+    assert set(env.metric_reductions.values()) <= {"sum", "max", "min", "mean", "last"}
 
 
 def test_only_the_watched_pairs_can_collide():
@@ -66,5 +67,5 @@ def test_only_the_watched_pairs_can_collide():
     for link in links:
         assert (f"{link}/table" in pairs) == (link != "arm/link_1")
         assert f"{link}/sphere_0" in pairs and f"{link}/sphere_1" in pairs
-    assert np.all(scene.hand.astype(int) + scene.arm + scene.own == 1)
+    assert np.all(scene.hand.astype(int) + scene.arm + scene.own + scene.work == 1)
     assert np.sum(scene.hand) == 2 * 3  # hand and fingers, with table and two spheres

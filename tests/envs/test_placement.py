@@ -21,7 +21,7 @@ def distances(a, b):
 def layout(request):
     task = request.getfixturevalue(request.param)
     info, data = task.starts.info, task.starts.data
-    placed = np.asarray(info["placed"])
+    placed = np.asarray(info["spheres"].placed)
     points, centers = (np.asarray(x, float) for x in (info["points"], data.mocap_pos))
     return request.param, task, points, centers, placed, np.asarray(data.qpos)
 

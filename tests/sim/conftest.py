@@ -8,7 +8,7 @@ import pytest
 
 from envs.scene import build_scene
 from rmp_mjx.robot import Robot
-from rmp_mjx.sim import watch_pairs
+from rmp_mjx.sim import add_pairs
 
 # A ball of 2 kg and a lying rod of 3 kg that can only move up and down.
 WEIGHTS = """
@@ -37,7 +37,7 @@ PAIRS = [("rod", "floor"), ("ball", "target"), ("ball", "floor")]
 @pytest.fixture(scope="session")
 def weights():
     spec = mujoco.MjSpec.from_string(WEIGHTS)
-    watch_pairs(spec, PAIRS, condim=1)
+    add_pairs(spec, PAIRS)
     return spec.compile()
 
 
