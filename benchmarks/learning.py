@@ -1,8 +1,8 @@
-"""Both controllers trained with the same settings: the README's curves and table.
+"""Controllers trained with the same settings: the README's curves and tables.
 
-`python -m benchmarks.learning --seeds 0 1` runs `train.py` for every controller and
-seed (finished runs in the folder are read, not repeated), then writes a figure and a
-JSON file.
+`python -m benchmarks.learning --env door --seeds 0 1` runs `train.py` for every
+controller and seed (finished runs in the folder are read, not repeated), then writes a
+figure and a JSON file.
 """
 
 from __future__ import annotations
@@ -23,9 +23,18 @@ from matplotlib.figure import Figure
 
 from benchmarks.common import ROOT, machine
 
-CONTROLLERS = {"vices": ("VICES", "#c0504d"), "rmp_vices": ("RMP-VICES", "#2a6fbb")}
+CONTROLLERS = {
+    "vices": ("VICES", "#c0504d"),
+    "rmp_vices": ("RMP-VICES", "#2a6fbb"),
+    "rmp_vices_literal": ("the paper's formulas, signs corrected", "#d9a13b"),
+}
+PROGRESS = {
+    "trajectory": ("per_1000_steps/via_points", "via points per 1,000 steps"),
+    "door": ("episode/door_angle", "largest hinge angle [rad]"),
+    "push": ("episode/goal_distance", "last distance of block and goal [m]"),
+}
+"""What shows a task's progress best."""
 PANELS = (
-    ("per_1000_steps/via_points", "via points per 1,000 steps"),
     ("episode/success", "success of finished episodes"),
     ("episode/return", "return of finished episodes"),
     ("cumulative/collision", "collisions, total"),
@@ -34,11 +43,11 @@ PANELS = (
 )
 
 
-def train(controller: str, seed: int, folder: Path, steps: int) -> float:
+def train(env: str, controller: str, seed: int, folder: Path, steps: int) -> float:
     """Train one run unless it is there; wall time of the whole process [s]."""
     timing = folder / "wall_s.json"
     if not timing.exists():
-        command = [sys.executable, "train.py", "--controller", controller]
+        command = [sys.executable, "train.py", "--env", env, "--controller", controller]
         command += ["--seed", str(seed), "--num_timesteps", str(steps)]
         command += ["--run_dir", str(folder), "--overwrite", "--no-video"]
         start = time.monotonic()
@@ -70,12 +79,12 @@ def curve(metrics: pl.DataFrame, name: str) -> tuple[np.ndarray, np.ndarray]:
     return shown["steps"].to_numpy(), shown[name].to_numpy()
 
 
-def plot(runs: dict[str, list[pl.DataFrame]], path: Path) -> None:
+def plot(env: str, runs: dict[str, list[pl.DataFrame]], path: Path) -> None:
     """One panel per measure, one line per run."""
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3).ravel()
-    for axis, (name, title) in zip(axes, PANELS, strict=True):
+    for axis, (name, title) in zip(axes, (PROGRESS[env], *PANELS), strict=True):
         for controller, frames in runs.items():
             label, color = CONTROLLERS[controller]
             for i, frame in enumerate(frames):
@@ -94,20 +103,30 @@ def plot(runs: dict[str, list[pl.DataFrame]], path: Path) -> None:
 def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, then write figure and JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", choices=tuple(PROGRESS), default="trajectory")
+    parser.add_argument(
+        "--controllers",
+        choices=tuple(CONTROLLERS),
+        nargs="+",
+        default=["vices", "rmp_vices"],
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--num_timesteps", type=int, default=400_000)
     parser.add_argument("--folder", type=Path, default=Path("runs/learning"))
-    parser.add_argument("--plot", type=Path, default=Path("docs/img/learning.png"))
+    parser.add_argument("--plot", type=Path, help="docs/img/learning_ENV.png")
     parser.add_argument(
-        "--json", type=Path, default=Path("benchmarks/results/learning.json")
+        "--json", type=Path, help="benchmarks/results/learning_ENV.json"
     )
     options = parser.parse_args(args)
+    env = options.env
+    picture = options.plot or Path(f"docs/img/learning_{env}.png")
+    results_file = options.json or Path(f"benchmarks/results/learning_{env}.json")
     runs: dict[str, list[pl.DataFrame]] = {}
     results: list[dict[str, Any]] = []
-    for controller in CONTROLLERS:
+    for controller in options.controllers:
         for seed in options.seeds:
-            folder = (options.folder / f"{controller}-seed{seed}").absolute()
-            wall = train(controller, seed, folder, options.num_timesteps)
+            folder = (options.folder / f"{env}-{controller}-seed{seed}").absolute()
+            wall = train(env, controller, seed, folder, options.num_timesteps)
             metrics = pl.read_parquet(folder / "metrics.parquet")
             runs.setdefault(controller, []).append(metrics)
             evaluation = json.loads((folder / "eval.json").read_text())
@@ -120,15 +139,16 @@ def main(args: Sequence[str] | None = None) -> None:
                     "evaluation": evaluation,
                 }
             )
-    plot(runs, options.plot)
+    plot(env, runs, picture)
     document = {
+        "env": env,
         "command": " ".join(["python", "-m", "benchmarks.learning", *sys.argv[1:]]),
         "machine": machine(),
         "num_timesteps": options.num_timesteps,
         "runs": results,
     }
-    options.json.parent.mkdir(parents=True, exist_ok=True)
-    options.json.write_text(json.dumps(document, indent=2) + "\n")
+    results_file.parent.mkdir(parents=True, exist_ok=True)
+    results_file.write_text(json.dumps(document, indent=2) + "\n")
     for run in results:
         print(
             run["controller"],
