@@ -1,18 +1,38 @@
-"""Evaluate a policy: `python eval.py --run RUN --episodes 100 --deterministic`."""
+"""Evaluate a policy: `python eval.py --run RUN --obstacles 2 --layout close`."""
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
 from rich.console import Console
 
 import envs
-from rmp_mjx import runtime
-from rmp_mjx.training import cli, evaluate, networks, report, run_folder
+from rmp_mjx import runtime, sim
+from rmp_mjx.training import cli, evaluate, film, networks, report
 from rmp_mjx.training.checkpoint import CheckpointError
-from rmp_mjx.training.config import ConfigError, validate
+from rmp_mjx.training.config import validate
 from rmp_mjx.training.train import load_agent
+
+
+def engine(env: envs.ArmEnv) -> str:
+    """Physics engine, timestep and friction cone of a task."""
+    name = next(n for n, kind in sim.ENGINES.items() if isinstance(env.physics, kind))
+    return f"{name}, {1e3 * env.options.sim_dt:g} ms, {env.options.cone}"
+
+
+def spheres(env: envs.ArmEnv) -> str:
+    """Obstacles of a task and their layout."""
+    asked = env.options
+    if not asked.obstacles:
+        return "no obstacles"
+    extra = [
+        f", {name} {value:g}"
+        for name in ("speed", "noise", "delay")
+        if (value := getattr(asked, f"obstacle_{name}"))
+    ]
+    return f"{asked.obstacles} spheres ({asked.layout}{''.join(extra)})"
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -20,14 +40,18 @@ def main(args: Sequence[str] | None = None) -> int:
     console = Console()
     options = cli.parse(cli.EvalConfig, args)
     try:
-        config, out = options.resolve()
-        validate(config, envs.names())
-    except ConfigError as error:
+        configs, out = options.resolve()
+        config = validate(configs[0], envs.names())
+        settings = [envs.parse_options(c.env, c.env_options) for c in configs]
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     runtime.configure()
-    env = envs.load(config.env, controller=config.controller, physics=config.physics)
-    iterations = 0
+    tasks = [
+        envs.load(c.env, controller=c.controller, physics=c.physics, **setting)
+        for c, setting in zip(configs, settings, strict=True)
+    ]
+    env, iterations = tasks[0], 0
     if options.run:
         try:
             iterations, agent = load_agent(
@@ -42,26 +66,30 @@ def main(args: Sequence[str] | None = None) -> int:
         agent = networks.random_agent(env.action_size)
 
     key = jax.random.key(options.seed)
-    results = evaluate.run_episodes(env, agent, options.episodes, key)
-    summary = evaluate.summarise(results, env.metric_reductions)
-    summary |= {
+    filmed = film.EPISODES if options.video else 0
+    own, tape = evaluate.record_episodes(env, agent, options.episodes, key, filmed)
+    results = {engine(env): own} | {
+        engine(task): evaluate.run_episodes(task, agent, options.episodes, key)
+        for task in tasks[1:]
+    }
+    about = {
         "agent": options.agent,
         "run": options.run,
         "training_iterations": iterations,
         "env": config.env,
         "controller": config.controller,
-        "physics": config.physics,
+        "env_options": settings[0],
         "deterministic": options.deterministic,
         "seed": options.seed,
     }
-    report.write_json(summary, out / run_folder.EVALUATION)
-    title = f"{options.agent} agent, {config.env}, {config.controller}"
-    console.print(report.table(summary, title))
+    title = f"{options.agent} agent, {config.env}, {config.controller}, {spheres(env)}"
+    columns = report.save(results, env.metric_reductions, about, out, title)
+    title += f", {options.episodes} episodes"
+    console.print(report.table(columns, title, env.task_metrics))
     if options.video:
         from envs.render import render  # loads graphics libraries
 
-        video = out / run_folder.VIDEO
-        report.film(env, agent, key, video, console, render)
+        film.publish(partial(render, env), tape, env.dt, out, console)
     console.print(f"results: {out}", markup=False, highlight=False)
     return 0
 

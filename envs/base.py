@@ -133,8 +133,6 @@ class ArmEnv(abc.ABC):
     """Seconds per policy step."""
     action_size = ACTION_SIZE
     """Entries of an action in [-1, 1]."""
-    episode_length = 1024
-    """Policy steps until the time limit, which the caller enforces."""
 
     Options: ClassVar[type[options.Options]] = options.Options
     """The task's options."""
@@ -172,6 +170,7 @@ class ArmEnv(abc.ABC):
         )
         self.physics = load_physics(asked.physics, self.scene.model)
         self.sim_dt = asked.sim_dt
+        self.episode_length = asked.episode_length
         self.n_substeps = options.substeps(asked.sim_dt)
         self.metric_reductions = METRICS | self.task_metrics
 
@@ -298,7 +297,8 @@ class ArmEnv(abc.ABC):
             obs=jnp.where(bad, 0.0, obs),
             reward=jnp.where(bad, 0.0, reward),
             done=(done | bad).astype(jnp.float32),
-            metrics={
+            metrics=state.metrics
+            | {
                 k: jnp.nan_to_num(jnp.asarray(v, jnp.float32))
                 for k, v in metrics.items()
             },

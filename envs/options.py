@@ -66,6 +66,8 @@ class Options:
     """Whether such an event ends the episode."""
     terminate_on_success: bool = False
     """Whether solving the task ends the episode."""
+    episode_length: int = 1024
+    """Policy steps until the time limit, which the caller enforces."""
     start_noise: float = 0.02
     """Standard deviation of the start configuration [rad]."""
 
@@ -85,6 +87,10 @@ class Options:
                 raise ValueError(
                     f"{name} must be at least 0, got {getattr(self, name)}"
                 )
+        if self.episode_length < 1:
+            raise ValueError(
+                f"episode_length must be at least 1, got {self.episode_length}"
+            )
         if not self.sphere_radius > 0:
             raise ValueError(
                 f"sphere_radius must be positive, got {self.sphere_radius}"

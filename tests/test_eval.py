@@ -4,8 +4,10 @@ import importlib
 import json
 import types
 
+import polars as pl
 import pytest
 
+import envs
 from tests.training import toys
 from tests.training.conftest import run
 
@@ -21,34 +23,104 @@ WANTED = (
 
 
 @pytest.fixture
-def evaluate(monkeypatch):
+def asked():
+    """Options that tasks were loaded with."""
+    return []
+
+
+@pytest.fixture
+def evaluate(monkeypatch, asked):
+    def load(name, **options):
+        asked.append(options)
+        return toys.Counter(physics=options["physics"])
+
     module = importlib.import_module("eval")
     fake = types.SimpleNamespace(
         names=lambda: ("counter", "trajectory"),
-        load=lambda name, **options: toys.Counter(),
+        load=load,
+        parse_options=lambda name, texts: dict(text.split("=") for text in texts),
     )
     monkeypatch.setattr(module, "envs", fake)
+    monkeypatch.setattr(module, "engine", lambda env: env.physics)
+    monkeypatch.setattr(module, "spheres", lambda env: "2 balls")
     return module.main
 
 
 def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):
     folder = tmp_path / "run"
     run(folder)
-    options = ["--run", str(folder), "--episodes", "9", "--deterministic"]
+    options = ["--run", str(folder), "--episodes", "9", "--deterministic", "--no-video"]
     assert evaluate(options) == 0
     found = json.loads((folder / "eval.json").read_text())
     assert set(WANTED) <= set(found)
     assert (found["episodes"], found["deterministic"]) == (9, True)
-    assert found["training_iterations"] == 4
-    assert "return_mean" in capsys.readouterr().out
+    assert (found["training_iterations"], found["engine"]) == (4, "auto")
+    assert "reference" not in found
+    said = capsys.readouterr().out
+    assert "policy agent, counter, rmp_vices, 2 balls, 9 episodes" in said
+    assert "return, mean +- sd" in said
+    for name in ("contact_forces.png", "clearances.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    assert len(pl.read_parquet(folder / "episodes.parquet")) == 9
     assert evaluate(options) == 0
     assert json.loads((folder / "eval.json").read_text()) == found
+
+
+def test_options_of_the_task_add_to_the_runs(evaluate, asked, tmp_path):
+    folder = tmp_path / "run"
+    run(folder, env_options=("variant=heavy", "layout=far"))
+    options = ["--run", str(folder), "--out", str(tmp_path / "out"), "--no-video"]
+    options += ["--episodes", "4", "--obstacles", "2", "--layout", "close"]
+    options += ["--obstacle_speed", "0.1", "--terminate_on_event", "False"]
+    assert evaluate(options) == 0
+    wanted = {"variant": "heavy", "layout": "close", "obstacles": "2"}
+    wanted |= {"obstacle_speed": "0.1", "terminate_on_event": "False"}
+    found = json.loads((tmp_path / "out" / "eval.json").read_text())
+    assert found["env_options"] == wanted
+    assert wanted.items() <= asked[0].items()
+
+
+def test_a_second_engine_gives_a_second_column(evaluate, asked, tmp_path, capsys):
+    options = ["--agent", "zero", "--env", "counter", "--out", str(tmp_path)]
+    options += ["--episodes", "5", "--physics", "mujoco", "--no-video"]
+    assert evaluate(options) == 0
+    assert [task["physics"] for task in asked] == ["auto", "mujoco"]
+    assert {"sim_dt": "0.002", "cone": "elliptic"}.items() <= asked[1].items()
+    assert "sim_dt" not in asked[0]
+    found = json.loads((tmp_path / "eval.json").read_text())
+    assert (found["engine"], found["reference"]["engine"]) == ("auto", "mujoco")
+    # The toy knows no engines: the same starts must give the same values.
+    assert found["reference"]["return_mean"] == found["return_mean"]
+    header = next(
+        x for x in capsys.readouterr().out.splitlines() if "episodes (95" in x
+    )
+    assert "auto" in header and "mujoco" in header
+    rows = pl.read_parquet(tmp_path / "episodes.parquet")
+    assert rows["engine"].to_list() == ["auto"] * 5 + ["mujoco"] * 5
+
+
+def test_a_task_that_cannot_be_drawn_says_so_in_one_line(evaluate, tmp_path, capsys):
+    options = ["--agent", "zero", "--env", "counter", "--out", str(tmp_path)]
+    assert evaluate([*options, "--episodes", "2"]) == 0
+    assert capsys.readouterr().out.count("no pictures: ") == 1
+
+
+def test_the_title_says_what_is_simulated_and_where():
+    module = importlib.import_module("eval")
+    env = envs.load("trajectory", physics="mujoco")
+    assert module.engine(env) == "mujoco, 5 ms, pyramidal"
+    assert module.spheres(env) == "no obstacles"
+    env = envs.load(
+        "trajectory", physics="mjx", obstacles=2, layout="close", obstacle_delay=0.1
+    )
+    assert module.engine(env) == "mjx, 5 ms, pyramidal"
+    assert module.spheres(env) == "2 spheres (close, delay 0.1)"
 
 
 @pytest.mark.parametrize("agent", ["zero", "random"])
 def test_an_agent_needs_no_run(evaluate, tmp_path, agent):
     options = ["--agent", agent, "--env", "counter", "--out", str(tmp_path)]
-    assert evaluate([*options, "--episodes", "4"]) == 0
+    assert evaluate([*options, "--episodes", "4", "--no-video"]) == 0
     found = json.loads((tmp_path / "eval.json").read_text())
     assert set(WANTED) <= set(found)
     assert found["agent"] == agent
@@ -61,6 +133,8 @@ def test_an_agent_needs_no_run(evaluate, tmp_path, agent):
         ["--run", "/nonexistent"],
         ["--agent", "zero", "--env", "nowhere"],
         ["--agent", "zero", "--episodes", "0"],
+        ["--agent", "zero", "--env_options", "controller=vices"],
+        ["--agent", "zero", "--env_options", "obstacles"],
     ],
 )
 def test_wrong_options_exit_with_code_2(evaluate, options, capsys):

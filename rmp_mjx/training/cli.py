@@ -39,6 +39,20 @@ def parse_train(args: Sequence[str] | None = None) -> TrainConfig:
     return parse(TrainConfig, args, default)
 
 
+REFERENCE = {"mujoco": ("sim_dt=0.002", "cone=elliptic"), "mjx": ()}
+"""Second physics engines, and the task's options that go with them."""
+
+SHORTHANDS = (
+    "obstacles",
+    "layout",
+    "obstacle_speed",
+    "obstacle_noise",
+    "obstacle_delay",
+    "terminate_on_event",
+)
+"""Options of `EvalConfig` that are options of the task."""
+
+
 @dataclasses.dataclass(frozen=True)
 class EvalConfig:
     """Evaluate the policy of a run, or a trivial agent for comparison."""
@@ -51,26 +65,42 @@ class EvalConfig:
     """Task; default: the run's, or trajectory."""
     controller: str | None = None
     """Low-level controller; default: the run's, or rmp_vices."""
-    physics: str | None = None
-    """Physics engine; default: the run's, or mujoco."""
+    obstacles: int | None = None
+    """Random spheres in every episode; this and the next five: default the run's."""
+    layout: str | None = None
+    """How near the spheres may be at the start: far or close."""
+    obstacle_speed: float | None = None
+    """Speed of the spheres [m/s]."""
+    obstacle_noise: float | None = None
+    """Standard deviation of their measured positions [m]."""
+    obstacle_delay: float | None = None
+    """Age of their measured positions [s]."""
+    terminate_on_event: bool | None = None
+    """Whether a collision or joint-limit event ends the episode."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the task as NAME=VALUE; they add to the run's."""
+    physics: Literal["mujoco", "mjx"] | None = None
+    """A second physics engine, where the same policy meets the same starts; mujoco: the
+    C engine with 2 ms steps and elliptic friction cones."""
     episodes: int = 100
     """Episodes, run in parallel."""
     deterministic: bool = False
     """Act with the policy's mean rather than samples."""
     seed: int = 0
     """Seed of the starts and of sampled actions."""
-    video: bool = False
-    """Render one episode, where headless rendering is available."""
+    video: bool = True
+    """Draw pictures and a video, where headless rendering is available."""
     out: str | None = None
-    """Folder for eval.json and the video; default: the run's folder, or one under
-    runs/ named after agent, task and controller."""
+    """Folder for the results; default: the run's folder, or one under runs/ named
+    after agent, task and controller."""
 
-    def resolve(self) -> tuple[TrainConfig, Path]:
+    def resolve(self) -> tuple[list[TrainConfig], Path]:
         """Fill in what the run says.
 
         Returns:
-            The training configuration to load the task and the policy with, and
-            the folder for results.
+            The configuration to load the task and the policy with, then, where one
+            is asked for, that of the second physics engine; and the folder for
+            results.
 
         Raises:
             ConfigError: The options contradict each other, or run is no run folder.
@@ -80,13 +110,21 @@ class EvalConfig:
         if (self.run is None) == (self.agent == "policy"):
             raise ConfigError("give either --run RUN or --agent zero|random")
         base = load_config(Path(self.run) / CONFIG) if self.run else TrainConfig()
+        asked = [(name, getattr(self, name)) for name in SHORTHANDS]
+        given = tuple(f"{name}={value}" for name, value in asked if value is not None)
         config = dataclasses.replace(
             base,
             resume=None,
             env=self.env or base.env,
             controller=self.controller or base.controller,
-            physics=self.physics or base.physics,
+            env_options=base.env_options + self.env_options + given,
         )
+        configs = [config]
+        if self.physics:
+            options = config.env_options + REFERENCE[self.physics]
+            configs.append(
+                dataclasses.replace(config, physics=self.physics, env_options=options)
+            )
         name = f"{self.agent}-{config.env}-{config.controller}"
         out = self.out or self.run or f"runs/{name}"
-        return config, Path(out)
+        return configs, Path(out)

@@ -5,8 +5,9 @@ import difflib
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-CONTROLLERS = ("rmp_vices", "vices")
+CONTROLLERS = ("rmp_vices", "vices", "rmp_vices_literal")
 PHYSICS = ("auto", "mujoco", "mjx")
 
 
@@ -21,9 +22,12 @@ class TrainConfig:
     env: str = "trajectory"
     """Task to learn."""
     controller: str = "rmp_vices"
-    """Low-level controller that the policy commands: rmp_vices or vices."""
+    """Low-level controller that the policy commands: rmp_vices, vices, or
+    rmp_vices_literal (the paper's formulas with their signs corrected)."""
     physics: str = "auto"
     """Physics engine: mujoco (C threads), mjx (JAX), or auto: mujoco on a CPU."""
+    env_options: tuple[str, ...] = ()
+    """Options of the task as NAME=VALUE, for instance obstacles=2 layout=close."""
     num_envs: int = 256
     """Environments that run in parallel."""
     num_timesteps: int = 400_000
@@ -73,11 +77,11 @@ class TrainConfig:
     checkpoints_kept: int = 3
     """Newest checkpoints that are kept."""
     eval_episodes: int = 100
-    """Episodes of the final evaluation; 0: none."""
+    """Episodes of the final evaluation; 0: none, and no pictures."""
     eval_deterministic: bool = True
     """Evaluate the mean action rather than sampled ones."""
     video: bool = True
-    """Render one episode at the end, where headless rendering is available."""
+    """Draw pictures and a video of the evaluation, where headless rendering works."""
 
     @property
     def steps_per_iteration(self) -> int:
@@ -154,6 +158,10 @@ def validate(config: TrainConfig, known_envs: Iterable[str]) -> TrainConfig:
     _known(config.env, "env", sorted(known_envs))
     _known(config.controller, "controller", CONTROLLERS)
     _known(config.physics, "physics", PHYSICS)
+    for text in config.env_options:
+        name = text.partition("=")[0]
+        if name in ("controller", "physics"):
+            raise ConfigError(f"{name} is an option of its own: --{name}")
     for name in AT_LEAST_ONE:
         if getattr(config, name) < 1:
             raise ConfigError(f"{name} must be at least 1, is {getattr(config, name)}")
@@ -197,18 +205,21 @@ def save_config(config: TrainConfig, path: Path) -> None:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read a configuration written by `save_config`.
+    """Read a configuration written by `save_config`; missing fields take defaults.
 
     Raises:
         ConfigError: The file is missing, is not JSON, or has unknown fields.
     """
     try:
-        values = json.loads(path.read_text())
-        values["hidden_sizes"] = tuple(values["hidden_sizes"])
+        saved = json.loads(path.read_text())
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in saved.items()
+        }
         return TrainConfig(**values)
     except FileNotFoundError as error:
         raise ConfigError(f"{path.parent} is no run folder: no {path.name}") from error
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (json.JSONDecodeError, AttributeError, TypeError) as error:
         raise ConfigError(f"{path} cannot be read as a configuration: {error}") from (
             error
         )

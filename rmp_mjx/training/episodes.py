@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-REDUCTIONS = ("sum", "max", "mean", "last")
+REDUCTIONS = ("sum", "max", "min", "mean", "last")
 """How per-step values can fold into an episode's."""
 
 
@@ -23,7 +23,7 @@ class EpisodeFold:
 
 
 def _initial(reduction: str) -> float:
-    return -jnp.inf if reduction == "max" else 0.0
+    return {"max": -jnp.inf, "min": jnp.inf}.get(reduction, 0.0)
 
 
 def start(reductions: Mapping[str, str], shape: tuple[int, ...]) -> EpisodeFold:
@@ -58,6 +58,8 @@ def update(
         old, new = fold.metrics[name], metrics[name]
         if reduction == "max":
             return jnp.maximum(old, new)
+        if reduction == "min":
+            return jnp.minimum(old, new)
         return new if reduction == "last" else old + new
 
     return EpisodeFold(

@@ -124,7 +124,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
                 running_statistics.init_state(jnp.zeros(env.observation_size)),
             ),
             scale=value_scale.init(),
-            rollout=rollout.init(env, config.num_envs, key_env),
+            rollout=rollout.init(env, config.num_envs, key_env, staggered=True),
             key=key,
             iteration=jnp.int32(0),
         )

@@ -1,113 +1,137 @@
-"""What a run leaves for its reader: table, eval.json, learning curve, video."""
+"""What an evaluation leaves for its reader: a table, eval.json, plots."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
-from jaxtyping import PRNGKeyArray
-from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from rmp_mjx import runtime
-from rmp_mjx.training import evaluate
-from rmp_mjx.training.networks import Agent
-from rmp_mjx.training.rollout import Env
+from rmp_mjx.training import figures, run_folder
+from rmp_mjx.training.evaluate import Episodes, summarise
 
-GROUPS = ("episode/", "per_1000_steps/")
-HIDDEN = ("episode/finished",)
+Summary = Mapping[str, Any]
+Columns = Mapping[str, Summary]
+"""Summaries by engine, the run's own first."""
+
+TERMINAL = 80
+"""Columns of a terminal that the table must fit."""
+
+MEASURES = (
+    ("mean return", "return_mean", 1.0),
+    ("success [%]", "success_rate", 100.0),
+    ("collision [%]", "collision_rate", 100.0),
+    ("joint limit [%]", "joint_limit_rate", 100.0),
+    ("self-collision [%]", "self_collision_rate", 100.0),
+    ("policy steps", "length_mean", 1.0),
+    ("worst contact [N]", "contact_force_peak_max", 1.0),
+    ("least clearance [mm]", "clearance_mean", 1e3),
+    ("its worst [mm]", "clearance_min", 1e3),
+    ("force at work [N]", "work_force_mean", 1.0),
+    ("torque saturated [%]", "torque_saturation_mean", 100.0),
+    ("set-point error [mm]", "tracking_error_mean", 1e3),
+)
+"""What the table shows where a task has it: label, name in a summary, factor.
+
+Shares are of the episodes, that of saturation is of the time.
+"""
+
+FAULTS = (
+    ("episodes lost to a non-finite state", "lost_episodes"),
+    ("most spheres without a place in an episode", "unplaced_obstacles_max"),
+    ("steps with more contacts than were read", "contact_overflow_max"),
+)
+"""What the table's caption mentions where it happened: label, name in a summary."""
 
 
-def write_json(values: dict[str, Any], path: Path) -> None:
-    """Write an evaluation's summary."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(values, indent=2) + "\n")
+def table(columns: Columns, title: str, own: Iterable[str] = ()) -> Table:
+    """The measures that a reader wants first, with 95 % intervals.
 
-
-def _number(value: Any) -> str:
-    if isinstance(value, int) or abs(value) >= 1000.0:
-        return f"{value:,.0f}"
-    return f"{value:.4g}"
-
-
-def table(summary: dict[str, Any], title: str) -> Table:
-    """A terminal table of a summary; intervals stand beside their values."""
-    shown = Table(title=title)
-    shown.add_column("measure")
-    shown.add_column("value", justify="right")
-    shown.add_column("95 % interval", justify="right")
-    for name, value in summary.items():
-        if isinstance(value, (int, float)):
-            bounds = summary.get(f"{name}_ci95")
-            interval = " .. ".join(map(_number, bounds)) if bounds else ""
-            shown.add_row(name, _number(value), interval)
+    Args:
+        columns: Summaries by engine.
+        title: What was evaluated.
+        own: Metrics of the task itself, shown by their means.
+    """
+    faults = [
+        f"{label}: {summary[key]:g} ({engine})"
+        for label, key in FAULTS
+        for engine, summary in columns.items()
+        if summary.get(key)
+    ]
+    shown = Table(
+        title=escape(title),
+        caption="\n".join(faults) or None,
+        min_width=min(len(title), TERMINAL),
+    )
+    shown.add_column("episodes (95 %)")
+    for engine in columns:
+        shown.add_column(escape(engine), justify="right")
+    spread = (
+        f"{_number(s['return_mean'])} +- {_number(s['return_sd'])}"
+        for s in columns.values()
+    )
+    shown.add_row("return, mean +- sd", *spread)
+    own_rows = [(name.replace("_", " "), f"{name}_mean", 1.0) for name in own]
+    for label, key, factor in (*MEASURES, *own_rows):
+        if all(key in summary for summary in columns.values()):
+            cells = (escape(_cell(s, key, factor)) for s in columns.values())
+            shown.add_row(escape(label), *cells)
     return shown
 
 
-def plot_learning_curve(metrics: Path, picture: Path, title: str) -> None:
-    """Plot every per-episode mean and event rate over the policy steps.
+def _cell(summary: Summary, key: str, factor: float) -> str:
+    """A value, with its interval where it has one."""
+    text, bounds = _number(factor * summary[key]), summary.get(f"{key}_ci95")
+    if bounds:
+        text += f" [{', '.join(_number(factor * bound) for bound in bounds)}]"
+    return text
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+def save(
+    results: Mapping[str, Episodes],
+    reductions: Mapping[str, str],
+    about: Mapping[str, Any],
+    folder: Path,
+    title: str,
+) -> Columns:
+    """Write `eval.json`, every episode's values, and the two histograms.
 
     Args:
-        metrics: Parquet file of a run.
-        picture: PNG file to write.
-        title: Heading.
+        results: Values of each episode by engine. The first one's summary is the
+            file's, a second one stands under `reference`.
+        reductions: How the environment's metrics fold.
+        about: What was evaluated, and how.
+        folder: Where the files go.
+        title: Heading of the plots.
+
+    Returns:
+        Summaries by engine.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    rows = pl.read_parquet(metrics)
-    names = [n for n in rows.columns if n.startswith(GROUPS) and n not in HIDDEN]
-    columns = 3
-    lines = -(-len(names) // columns)
-    figure = Figure(figsize=(4 * columns, 2.4 * lines), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = np.atleast_1d(figure.subplots(lines, columns)).ravel()
-    for name, axis in zip(names, axes, strict=False):
-        shown = rows.select("steps", name).drop_nulls()
-        axis.plot(shown["steps"], shown[name], lw=1.2)
-        axis.set_title(name.replace("_", " "), fontsize=9)
-        axis.tick_params(labelsize=8)
-        axis.grid(alpha=0.3)
-    for axis in axes[len(names) :]:
-        axis.set_axis_off()
-    for axis in axes[max(0, len(names) - columns) : len(names)]:
-        axis.set_xlabel("policy steps", fontsize=8)
-    figure.suptitle(title, fontsize=10)
-    figure.savefig(picture, dpi=120)
-
-
-def write_video(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
-    """Write frames (h, w, 3) uint8 as an MP4, with the bundled encoder."""
-    import imageio_ffmpeg
-    import mediapy
-
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    mediapy.write_video(str(path), frames, fps=fps)
-
-
-def film(
-    env: Env, agent: Agent, key: PRNGKeyArray, path: Path, console: Console, render: Any
-) -> None:
-    """Render one episode to a video, or say in one line why there is none.
-
-    Args:
-        env: Single environment.
-        agent: Batched agent.
-        key: Randomness of the start and the actions.
-        path: MP4 file to write.
-        console: Terminal.
-        render: Called as `render(env, states)`; gives frames (h, w, 3) uint8.
-    """
-    if runtime.choose_gl() is None:
-        console.print("no video: no headless rendering here (neither EGL nor OSMesa)")
-        return
-    try:
-        frames = render(env, evaluate.record_episode(env, agent, key))
-        write_video(frames, path, fps=1.0 / env.dt)
-    except Exception as error:  # graphics stacks fail in many ways; numbers are safe
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        console.print(f"no video: {reason}", markup=False, highlight=False)
-    else:
-        console.print(f"video: {path}", markup=False, highlight=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    columns = {
+        name: {**summarise(values, reductions), "engine": name}
+        for name, values in results.items()
+    }
+    own, *others = columns.values()
+    values = {**own, **about} | ({"reference": others[0]} if others else {})
+    path = folder / run_folder.EVALUATION
+    path.write_text(json.dumps(values, indent=2) + "\n")
+    rows = [
+        pl.DataFrame(dict(values)).with_columns(engine=pl.lit(name))
+        for name, values in results.items()
+    ]
+    pl.concat(rows).write_parquet(folder / run_folder.EPISODES)
+    for metric, plot, name in (
+        ("contact_force_peak", figures.plot_forces, run_folder.FORCES),
+        ("clearance", figures.plot_clearances, run_folder.CLEARANCES),
+    ):
+        found = {k: values[metric] for k, values in results.items() if metric in values}
+        if found:
+            plot(found, folder / name, title)
+    return columns

@@ -59,6 +59,8 @@ class RolloutState:
     """Environment states, batched."""
     fold: episodes.EpisodeFold
     """Unfinished episodes."""
+    age: Int[Array, " b"]
+    """Policy steps towards the time limit."""
 
 
 @struct.dataclass
@@ -146,12 +148,28 @@ def finite_step(
     ), finite
 
 
-def init(env: Env, num_envs: int, key: PRNGKeyArray) -> RolloutState:
-    """Reset a batch of environments."""
+def init(
+    env: Env, num_envs: int, key: PRNGKeyArray, staggered: bool = False
+) -> RolloutState:
+    """Reset a batch of environments.
+
+    Args:
+        env: The environment.
+        num_envs: Size of the batch.
+        key: Randomness of the starts.
+        staggered: Cut the first episodes off at random times, so that a batch of
+            transitions shows all phases of an episode rather than one. A cut is a
+            truncation: the value beyond it still counts. The statistics of finished
+            episodes leave out those that only this cut ended.
+    """
     env_state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     env_state = cast_like(env_state, env_state)
     fold = episodes.start(env.metric_reductions, (num_envs,))
-    return RolloutState(env_state=env_state, fold=fold)
+    age = jnp.zeros(num_envs, jnp.int32)
+    if staggered:
+        key_age = jax.random.fold_in(key, num_envs)
+        age = jax.random.randint(key_age, (num_envs,), 0, env.episode_length)
+    return RolloutState(env_state=env_state, fold=fold, age=age)
 
 
 def init_stats(env: Env) -> RolloutStats:
@@ -198,8 +216,9 @@ def unroll(
         new, finite = finite_step(env, state.env_state, action)
         fold = episodes.update(state.fold, new.reward, new.metrics, kinds)
         termination = new.done > 0.5
-        done = termination | (fold.length >= env.episode_length)
-        finished = done & finite
+        age = state.age + 1
+        done = termination | (age >= env.episode_length)
+        finished = done & finite & (termination | (age == fold.length))
         values = episodes.finish(fold, kinds)
         stats = RolloutStats(
             episodes=stats.episodes + finished.sum(dtype=jnp.int32),
@@ -228,7 +247,9 @@ def unroll(
             done.any(), reset_done, lambda done, s, key: s, done, new, key_reset
         )
         fold = episodes.restart(fold, done, kinds)
-        return (RolloutState(env_state=env_state, fold=fold), stats), transition
+        age = jnp.where(done, 0, age)
+        state = RolloutState(env_state=env_state, fold=fold, age=age)
+        return (state, stats), transition
 
     (state, stats), transitions = jax.lax.scan(
         step, (state, init_stats(env)), jax.random.split(key, length)

@@ -28,8 +28,13 @@ METRICS = "metrics.parquet"
 CHECKPOINTS = "checkpoints"
 TENSORBOARD = "tensorboard"
 CURVE = "learning_curve.png"
-VIDEO = "video.mp4"
 EVALUATION = "eval.json"
+EPISODES = "episodes.parquet"
+FORCES = "contact_forces.png"
+CLEARANCES = "clearances.png"
+INSTANCE = "instance.png"
+STORYBOARD = "storyboard.png"
+VIDEO = "video.mp4"
 LOCK = "lock"
 PACKAGES = (
     "jax",
@@ -49,8 +54,13 @@ RESULTS = (
     CHECKPOINTS,
     TENSORBOARD,
     CURVE,
-    VIDEO,
     EVALUATION,
+    EPISODES,
+    FORCES,
+    CLEARANCES,
+    INSTANCE,
+    STORYBOARD,
+    VIDEO,
 )
 
 

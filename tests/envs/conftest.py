@@ -16,10 +16,10 @@ from rmp_mjx.robot import Robot
 
 @pytest.fixture(scope="session")
 def make():
-    """`make(controller, **options)`: the env, its vmapped reset and step, compiled."""
+    """`make(controller, task, **options)`: env, vmapped reset and step, compiled."""
 
     @functools.cache
-    def build(controller, **options):
+    def build(controller, task="trajectory", **options):
         if controller == "torques":
             robot = Robot.load("jaco2")
             data = mujoco.MjData(robot.mj_model)
@@ -27,7 +27,7 @@ def make():
             mujoco.mj_forward(robot.mj_model, data)
             controller = Torques(np.asarray(data.qfrc_bias, np.float32))
         options = {"physics": "mujoco", "obstacles": 2} | options
-        env = envs.load("trajectory", controller=controller, **options)
+        env = envs.load(task, controller=controller, **options)
         return SimpleNamespace(
             env=env,
             reset=jax.jit(jax.vmap(env.reset)),

@@ -28,6 +28,7 @@ def test_the_defaults_are_valid():
         ({"env": "trajectroy"}, "known: door, trajectory. Did you mean 'trajectory'"),
         ({"controller": "pid"}, "known: rmp_vices, vices"),
         ({"physics": "bullet"}, "known: auto, mujoco, mjx"),
+        ({"env_options": ("physics=mjx",)}, "an option of its own: --physics"),
         ({"num_envs": 0}, "num_envs must be at least 1"),
         ({"num_envs": 3, "unroll_length": 5}, "3 * 5 = 15 does not divide into"),
         ({"learning_rate": 0.0}, "learning_rate must be positive"),
@@ -70,9 +71,16 @@ def test_iterations_cover_the_timesteps():
 
 
 def test_a_configuration_survives_its_file(tmp_path):
-    config = TrainConfig(hidden_sizes=(3, 5), seed=7)
+    config = TrainConfig(hidden_sizes=(3, 5), env_options=("layout=close",), seed=7)
     save_config(config, tmp_path / "config.json")
     assert load_config(tmp_path / "config.json") == config
+
+
+def test_what_an_older_file_does_not_say_takes_its_default(tmp_path):
+    (tmp_path / "config.json").write_text('{"hidden_sizes": [3, 5], "seed": 7}')
+    assert load_config(tmp_path / "config.json") == TrainConfig(
+        hidden_sizes=(3, 5), seed=7
+    )
 
 
 @pytest.mark.parametrize("content", ["{", "[]", '{"hidden_sizes": [], "x": 1}'])
@@ -101,6 +109,17 @@ def test_evaluation_needs_a_run_or_an_agent():
         cli.EvalConfig().resolve()
     with pytest.raises(ConfigError, match="either"):
         cli.EvalConfig(run="x", agent="zero").resolve()
-    config, out = cli.EvalConfig(agent="random", env="door").resolve()
+    (config,), out = cli.EvalConfig(agent="random", env="door").resolve()
     assert config.env == "door"
     assert str(out) == "runs/random-door-rmp_vices"
+
+
+def test_evaluation_adds_its_options_to_the_runs_and_the_engine_to_both(tmp_path):
+    save_config(TrainConfig(env_options=("layout=far",)), tmp_path / "config.json")
+    asked = cli.EvalConfig(run=str(tmp_path), obstacles=2, physics="mujoco")
+    (own, reference), out = asked.resolve()
+    assert own.env_options == ("layout=far", "obstacles=2")
+    assert own.physics == "auto" and reference.physics == "mujoco"
+    extra = ("sim_dt=0.002", "cone=elliptic")
+    assert reference.env_options == own.env_options + extra
+    assert out == tmp_path

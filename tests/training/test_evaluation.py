@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from rmp_mjx.training import evaluate
+from rmp_mjx.training import evaluate, recording
 from rmp_mjx.training.networks import random_agent, zero_agent
 from rmp_mjx.training.train import load_agent
 from tests.training import toys
@@ -32,6 +32,7 @@ def test_every_environment_runs_exactly_one_episode(results):
     )
     np.testing.assert_array_equal(results["return"], -1.0 * reached)
     np.testing.assert_array_equal(results["collision"], reached)
+    np.testing.assert_allclose(results["clearance"], 0.1 - reached, atol=1e-7)
     assert not results["lost"].any()
 
 
@@ -54,6 +55,10 @@ def test_the_summary_counts_what_the_episodes_say(results):
     assert summary["collision_per_1000_steps"] == pytest.approx(1000 * hits / steps)
     assert summary["success_rate"] == 0.0
     assert summary["effort_max"] == pytest.approx(float(results["effort"].max()))
+    assert summary["clearance_min"] == pytest.approx(-0.9)
+    assert summary["clearance_p05"] <= summary["clearance_mean"] <= 0.1
+    low, high = summary["effort_mean_ci95"]
+    assert low < summary["effort_mean"] < high
 
 
 def test_an_episode_that_becomes_nonfinite_is_lost_and_counted():
@@ -71,9 +76,35 @@ def test_a_loaded_policy_acts_as_the_trained_one(finished):
     np.testing.assert_array_equal(agent(obs, KEY), result.agent(obs, KEY))
 
 
-def test_a_recorded_episode_starts_at_the_reset_and_ends_when_done():
-    states = evaluate.record_episode(toys.Counter(), zero_agent(1), KEY)
-    assert float(states[0].obs[1]) == 0.0
-    assert [float(s.obs[1]) for s in states] == list(range(len(states)))
-    ended = float(states[-1].done) == 1.0
-    assert ended or len(states) == toys.Counter().episode_length + 1
+@pytest.fixture(scope="module")
+def recorded():
+    """The same episodes, the first four on tape."""
+    return evaluate.record_episodes(
+        toys.Counter(), random_agent(1), EPISODES, KEY, recorded=4
+    )
+
+
+def test_recording_changes_no_value(results, recorded):
+    for name, values in results.items():
+        np.testing.assert_array_equal(recorded[0][name], values)
+
+
+def test_a_recording_holds_each_state_from_the_reset_to_the_end(results, recorded):
+    tape = recorded[1]
+    np.testing.assert_array_equal(tape.lengths, results["length"][:4])
+    for episode, length in enumerate(tape.lengths):
+        states = [tape.state(episode, t) for t in range(length + 1)]
+        assert [float(s.obs[1]) for s in states] == list(range(length + 1))
+        ended = float(states[-1].done) == 1.0
+        assert ended or length == toys.Counter().episode_length
+        beyond = tape.state(episode, int(length) + 3)
+        np.testing.assert_array_equal(beyond.obs, states[-1].obs)
+
+
+def test_a_long_episode_is_recorded_up_to_the_limit(monkeypatch):
+    monkeypatch.setattr(recording, "MAX_STEPS", 3)
+    env = toys.EndlessReward()
+    results, tape = evaluate.record_episodes(env, zero_agent(1), 2, KEY, recorded=9)
+    assert (results["length"] == 5).all()
+    assert tape.count == 2 and (tape.lengths == 3).all()
+    assert int(tape.state(1, 9).data["t"]) == 3

@@ -1,4 +1,4 @@
-"""Logs, tables, plots and videos."""
+"""Logs, tables and plots."""
 
 import io
 
@@ -7,11 +7,8 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from rmp_mjx import runtime
-from rmp_mjx.training import evaluate, report
+from rmp_mjx.training import figures, report
 from rmp_mjx.training.logging import RunLogger
-from rmp_mjx.training.networks import zero_agent
-from tests.training import toys
 
 
 def rows(first, last):
@@ -62,43 +59,51 @@ def test_a_terminal_sees_progress_and_the_time_left(tmp_path):
 
 def test_the_learning_curve_is_a_picture_of_every_episode_value(tmp_path):
     log(tmp_path, 1, 20)
-    report.plot_learning_curve(tmp_path / "m.parquet", tmp_path / "c.png", "title")
+    figures.plot_learning_curve(tmp_path / "m.parquet", tmp_path / "c.png", "title")
     assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_table_shows_intervals_beside_their_rates():
+def printed(columns, own=()):
     text = io.StringIO()
-    summary = {"success_rate": 0.5, "success_rate_ci95": [0.25, 0.75], "agent": "x"}
-    Console(file=text, width=100).print(report.table(summary, "title"))
-    assert "0.25 .. 0.75" in text.getvalue()
-
-
-def film(tmp_path, render):
-    text = io.StringIO()
-    report.film(
-        toys.Counter(),
-        zero_agent(1),
-        evaluate.jax.random.key(0),
-        tmp_path / "v.mp4",
-        Console(file=text, width=200),
-        render,
-    )
+    Console(file=text, width=80).print(report.table(columns, "a title [N]", own))
     return text.getvalue()
 
 
-def test_a_video_is_written_where_rendering_works(tmp_path, monkeypatch):
-    monkeypatch.setattr(runtime, "choose_gl", lambda: "egl")
-    said = film(tmp_path, lambda env, s: [np.zeros((32, 32, 3), np.uint8)] * len(s))
-    assert "video:" in said
-    assert (tmp_path / "v.mp4").stat().st_size > 0
+SUMMARY = {
+    "return_mean": 12345.6,
+    "return_sd": 78.9,
+    "success_rate": 0.5,
+    "success_rate_ci95": [0.25, 0.75],
+    "clearance_min": 0.0123,
+    "laps_mean": 1.5,
+    "lost_episodes": 0,
+}
 
 
-@pytest.mark.parametrize("gl", [None, "egl"])
-def test_without_rendering_one_line_says_so(tmp_path, monkeypatch, gl):
-    def render(env, states):
-        raise RuntimeError("no\ncontext")
+def test_the_table_shows_the_return_first_and_intervals_beside_their_rates():
+    said = printed({"toy": SUMMARY}, ["laps"])
+    rows = [line.strip("│ ") for line in said.splitlines() if "│" in line]
+    assert rows[0].startswith("return, mean +- sd") and "12,346 +- 78.9" in rows[0]
+    assert "50 [25, 75]" in said
+    assert "[mm]" in said and "12.3" in said  # rich does not take units for its markup
+    assert "laps" in said and "a title [N]" in said
+    assert "lost" not in said
 
-    monkeypatch.setattr(runtime, "choose_gl", lambda: gl)
-    said = film(tmp_path, render)
-    assert said.count("\n") == 1
-    assert said.startswith("no video")
+
+def test_two_engines_stand_side_by_side_with_what_went_wrong_below():
+    other = SUMMARY | {"success_rate": 0.25, "lost_episodes": 3}
+    said = printed({"one": SUMMARY, "two": other})
+    row = next(line for line in said.splitlines() if "success" in line)
+    assert row.index("50 [") < row.index("25 [25, ")
+    assert "episodes lost to a non-finite state: 3 (two)" in said
+
+
+@pytest.mark.parametrize("touched", [True, False])
+def test_histograms_are_pictures_with_or_without_contact(tmp_path, touched):
+    peaks = {"one": np.array([0.0, 30.0 * touched]), "two": np.zeros(3)}
+    figures.plot_forces(peaks, tmp_path / "f.png", "title")
+    figures.plot_clearances(
+        {"one": np.array([0.1, -0.01])}, tmp_path / "c.png", "title"
+    )
+    for name in ("f.png", "c.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

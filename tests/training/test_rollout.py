@@ -106,3 +106,26 @@ def test_nonfinite_steps_are_masked_counted_and_reset():
     assert stats.episodes == (~bad).sum()
     for leaf in jax.tree.leaves((data, stats)):
         assert np.isfinite(leaf).all()
+
+
+def test_staggered_starts_spread_the_time_limit_and_count_whole_episodes_only():
+    """`Counter` ends an episode by itself or by the time limit."""
+    env = toys.Counter()
+    limit = env.episode_length
+
+    @jax.jit
+    def run(key):
+        state = rollout.init(env, 64, key, staggered=True)
+        return state, rollout.unroll(env, act, state, key, 3 * limit)
+
+    start, (_, data, stats) = jax.device_get(run(jax.random.key(0)))
+    assert len(np.unique(start.age)) == limit
+    ends = (data.truncation + data.termination) > 0
+    first = np.argmax(ends, axis=0)
+    np.testing.assert_array_equal(
+        first <= limit - 1 - start.age, np.ones_like(first, bool)
+    )
+    cut = np.take_along_axis(data.truncation, first[None], 0)[0] > 0
+    partial = cut & (start.age > 0)
+    assert partial.sum() > 10
+    assert stats.episodes == ends.sum() - partial.sum()

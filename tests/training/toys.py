@@ -30,15 +30,15 @@ class Toy:
     action_size: int = 1
     dt: float = 0.05
     episode_length: int = 1
+    physics: str = "toy"
+
+    task_metrics = {"effort": "mean", "final": "last"}  # noqa: RUF012
 
     @property
     def metric_reductions(self):
-        return {
-            "success": "max",
-            "collision": "sum",
-            "effort": "mean",
-            "final": "last",
-        }
+        events = {"success": "max", "collision": "sum"}
+        safety = {"contact_force_peak": "max", "clearance": "min"}
+        return events | safety | self.task_metrics
 
     def _state(self, data, obs, reward, done, action=0.0):
         return ToyState(
@@ -49,6 +49,8 @@ class Toy:
             metrics={
                 "success": jnp.float32(reward > 0.9),
                 "collision": jnp.float32(reward < -0.9),
+                "contact_force_peak": 100.0 * jnp.float32(reward < -0.9),
+                "clearance": 0.1 - jnp.float32(reward < -0.9),
                 "effort": jnp.float32(jnp.mean(jnp.abs(action))),
                 "final": jnp.float32(reward),
             },

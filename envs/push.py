@@ -1,0 +1,162 @@
+"""Block pushing: a weighted block to a goal on the table (the paper's own task)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from envs import options
+from envs.base import ArmEnv, Entry, Score
+from envs.placement import CANDIDATES
+from envs.safety import SafetyRecord
+from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
+from rmp_mjx.robot.kinematics import SiteState
+from rmp_mjx.sim import PhysicsState
+
+HALF_SIZE = 0.03
+"""Half an edge of the block [m]."""
+
+REST_HEIGHT = TABLE_HEIGHT + HALF_SIZE
+"""Height of the centre of the block when it stands on the table [m]."""
+
+BLOCK_LOW, BLOCK_HIGH = np.array([0.42, -0.10]), np.array([0.52, 0.10])
+"""Corners of the area where the block starts [m]."""
+
+GOAL_LOW, GOAL_HIGH = np.array([0.38, -0.26]), np.array([0.58, 0.26])
+"""Corners of the area where the goal may be [m]."""
+
+HAND_ROOM = 0.085
+"""Distance behind the block's centre that is kept clear for the hand [m]."""
+
+NEAREST_GOAL, FARTHEST_GOAL = 0.10, 0.25
+"""Distance of the goal from where the block starts [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PushOptions(options.Options):
+    """Options of block pushing."""
+
+    episode_length: int = 256
+    """Policy steps until the time limit; the paper's is 1024."""
+    block_mass: float = 0.3
+    """Mass of the block [kg]."""
+    block_friction: float = 0.5
+    """Sliding friction of the block on the table and on the hand."""
+    reward_slope: float = 5.0
+    """Slope k of the rewards ``1 - tanh(k d)`` [1/m]; the paper's is 20."""
+
+    def __post_init__(self):
+        """Check the values."""
+        super().__post_init__()
+        for name in ("block_mass", "block_friction", "reward_slope"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+class Push(ArmEnv):
+    """Push the block to within 5 cm of the goal, and keep it there.
+
+    Reward in every step, with the distances h of grip and block, and g of block and
+    goal: ``3 (1 - tanh k h) + 10 (1 - tanh k g)``; an event costs `event_penalty`.
+    The block alone may be touched, by the hand alone.
+    """
+
+    Options = PushOptions
+    name = "push"
+    q_start = np.array([3.152, 3.878, -0.009, 1.317, 0.065, 3.708, 3.147])
+    sphere_box = (np.array([0.32, -0.28, -0.05]), np.array([0.60, 0.28, 0.20]))
+    task_metrics: ClassVar[dict[str, str]] = {"goal_distance": "last"}
+    hand_reward = 3.0
+    goal_reward = 10.0
+    reach = 0.05
+    """The block counts as pushed home within this distance of the goal [m]."""
+
+    @property
+    def task_entries(self) -> tuple[Entry, ...]:
+        """The block from the grip, the goal from the block."""
+        return (
+            Entry("hand_to_block", 3, "m", "block's centre from the grip"),
+            Entry("block_to_goal", 3, "m", "goal from the block's centre"),
+        )
+
+    def objects(self, spec: mujoco.MjSpec) -> Contacts:
+        """Stand the block on the table."""
+        asset = mujoco.MjSpec.from_file(str(ASSETS / "push.xml"))
+        asset.option.timestep = spec.option.timestep
+        asked = self.options
+        asset.geom("block").mass = asked.block_mass
+        spec.attach(asset, prefix="push/", frame=spec.worldbody.add_frame())
+        return Contacts(
+            work=("push/block",),
+            work_friction=asked.block_friction,
+            passive=(("push/block", "table", asked.block_friction),),
+        )
+
+    def begin(
+        self, rng: Array, q: Float[Array, " n"]
+    ) -> tuple[Array, dict[str, Array]]:
+        """Place the block, turned at random, and a goal that it can be pushed to."""
+        key_block, key_turn, key_goal = jax.random.split(rng, 3)
+        block = jax.random.uniform(key_block, (2,), minval=BLOCK_LOW, maxval=BLOCK_HIGH)
+        half_turn = 0.5 * jax.random.uniform(key_turn, minval=-0.785, maxval=0.785)
+        goals = jax.random.uniform(
+            key_goal, (CANDIDATES, 2), minval=GOAL_LOW, maxval=GOAL_HIGH
+        )
+        distance = jnp.linalg.norm(goals - block, axis=-1)
+        fits = (distance >= NEAREST_GOAL) & (distance <= FARTHEST_GOAL)
+        goal = jnp.append(goals[jnp.argmax(fits)], REST_HEIGHT)
+        start = jnp.append(block, REST_HEIGHT)
+        turn = jnp.array([jnp.cos(half_turn), 0.0, 0.0, jnp.sin(half_turn)])
+        return jnp.concatenate([start, turn]), {"goal": goal, "start": start}
+
+    def block(self, data: PhysicsState) -> Float[Array, " 3"]:
+        """Centre of the block [m]."""
+        n = self.robot.n
+        return data.qpos[n : n + 3]
+
+    def keep_clear(self, task: dict[str, Array]) -> Float[Array, "v 3"]:
+        """The block's top all along its straight way, and room behind it for the hand.
+
+        A sphere of 5 cm that keeps its centre 8 cm from them is clear of block and
+        goal, whichever way the block is turned.
+        """
+        way = task["goal"] - task["start"]
+        ahead = way / jnp.linalg.norm(way)
+        tail = task["start"] - HAND_ROOM * ahead
+        share = jnp.linspace(0.0, 1.0, 8)[:, None, None]
+        center = tail + share * (task["goal"] - tail)
+        turn = np.arange(6) * np.pi / 3
+        spoke = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
+        rim = np.sqrt(2.0) * HALF_SIZE * np.concatenate([np.zeros((1, 3)), spoke])
+        top = rim + np.array([0.0, 0.0, HALF_SIZE])
+        return (center + top).reshape(-1, 3)
+
+    def score(
+        self,
+        data: PhysicsState,
+        site: SiteState,
+        record: SafetyRecord,
+        task: dict[str, Array],
+        step: Array,
+    ) -> Score:
+        """Reward the hand for nearing the block, and the block for nearing the goal."""
+        block = self.block(data)
+        hand = jnp.linalg.norm(block - site.p)
+        goal = jnp.linalg.norm(task["goal"] - block)
+        slope = self.options.reward_slope
+        reward = self.hand_reward * (1.0 - jnp.tanh(slope * hand))
+        reward += self.goal_reward * (1.0 - jnp.tanh(slope * goal))
+        return Score(task, reward, goal < self.reach, {"goal_distance": goal})
+
+    def observe(
+        self, data: PhysicsState, site: SiteState, task: dict[str, Array]
+    ) -> dict[str, Array]:
+        """Hand to block, block to goal."""
+        block = self.block(data)
+        return {"hand_to_block": block - site.p, "block_to_goal": task["goal"] - block}
