@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arm_tasks import Torques
-from brax.envs.base import Env as BraxEnv
-from brax.envs.base import State as BraxState
 from brax.envs.wrappers import training as brax_training
 
 import envs
+from envs.brax import BraxTask
 from rmp_mjx.training.episodes import REDUCTIONS
 
 LANES = 4
@@ -139,47 +138,6 @@ def test_the_observation_is_documented_entry_by_entry(limp):
         names.append(name)
     assert end == limp.observation_size
     assert len(set(names)) == len(names)
-
-
-class BraxTask(BraxEnv):
-    """A task for Brax's wrappers: all of its state takes the physics' place.
-
-    Brax's automatic reset brings back `pipeline_state` and `obs` alone, so what the
-    task carries along must be in there; `info` is left to the wrappers, which also add
-    to the metrics.
-    """
-
-    def __init__(self, task):
-        self.task = task
-
-    @property
-    def observation_size(self):
-        return self.task.observation_size
-
-    @property
-    def action_size(self):
-        return self.task.action_size
-
-    @property
-    def backend(self):
-        return "mujoco"
-
-    def reset(self, rng):
-        return self._state(self.task.reset(rng), {}, {})
-
-    def step(self, state, action):
-        new = self.task.step(state.pipeline_state, action)
-        return self._state(new, state.metrics, state.info)
-
-    def _state(self, state, metrics, info):
-        return BraxState(
-            pipeline_state=state,
-            obs=state.obs,
-            reward=state.reward,
-            done=state.done,
-            metrics=metrics | state.metrics,
-            info=info,
-        )
 
 
 def roll(step, start):
