@@ -7,10 +7,12 @@ Random policies visit what a learning policy may visit, without learning. Run as
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
@@ -19,13 +21,17 @@ from benchmarks.common import Row, show, write_json
 from benchmarks.safety_study import ENDING, EVENTS, Group, Study
 from envs.placement import LAYOUTS
 from rmp_mjx import runtime
+from rmp_mjx.control.torque import clip_torque
 from rmp_mjx.rmp.leaves import (
     Barrier,
     JointLimitBarrier,
     PaperCollision,
     RMPflowJointLimit,
+    collision_near,
     collision_transit,
 )
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state
 
 Figures = dict[str, np.ndarray]
 Make = Callable[[rmp.Robot], "rmp.RMPVICES | rmp.VICES"]
@@ -50,6 +56,39 @@ def _off(robot: rmp.Robot) -> rmp.RMPVICES:
     return rmp.RMPVICES(robot, off, off, limits)
 
 
+class _NoCurvature(Barrier):
+    """The barrier without its geodesic term."""
+
+    def scalar(self, x, xd):
+        f, m = super().scalar(x, xd)
+        gap = jnp.maximum(x - self.margin, self.x_min)
+        return f - m * jnp.minimum(xd, 0.0) ** 2 / gap, m
+
+
+class _Clipped(rmp.RMPVICES):
+    """RMP-VICES that clips each torque by itself."""
+
+    def __call__(self, q, qd, setpoint, obstacles):
+        out = super().__call__(q, qd, setpoint, obstacles)
+        Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
+        tau, scale = clip_torque(Mq @ out.qdd + bias, self.robot.tau_max)
+        return out.replace(
+            tau=tau, diagnostics=out.diagnostics | {"torque_scale": scale}
+        )
+
+
+def _collision(**changes: float) -> Make:
+    """Default leaves, but these parameters of the collision leaves."""
+    leaf = collision_near().replace(**changes)
+    return lambda robot: rmp.RMPVICES(robot, leaf, leaf)
+
+
+def _no_curvature(robot: rmp.Robot) -> rmp.RMPVICES:
+    leaf = _NoCurvature(**dataclasses.asdict(collision_near()))
+    limits = JointLimitBarrier(robot.q_lower, robot.q_upper)
+    return rmp.RMPVICES(robot, leaf, leaf, limits)
+
+
 def _transit(robot: rmp.Robot) -> rmp.RMPVICES:
     return rmp.RMPVICES(robot, collision_transit(), collision_transit())
 
@@ -58,6 +97,19 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
     "vices": (rmp.VICES, "baseline"),
     "rmp_vices": (rmp.RMPVICES, "defaults"),
     "transit": (_transit, "collision leaf for moving among obstacles"),
+    "holding_orientation": (
+        lambda r: rmp.RMPVICES(r, yielding=rmp.Yielding(least=1.0)),
+        "orientation does not yield beside obstacles",
+    ),
+    "letting_go_at_once": (
+        _collision(v_out=1e-9),
+        "the metric ends with the approach",
+    ),
+    "no_curvature": (_no_curvature, "collision leaves without the geodesic term"),
+    "no_floor": (_collision(eps=0.0), "collision leaves without the velocity floor"),
+    "no_margin": (_collision(margin=0.0), "collision leaves without a margin"),
+    "long_range": (_collision(r=10.0), "collision leaves without a range"),
+    "clipped_torque": (_Clipped, "each torque clipped by itself"),
     "no_self_collision": (
         lambda r: rmp.RMPVICES(r, self_collision=Barrier(mu=0.0)),
         "self-collision leaf switched off",
@@ -67,6 +119,7 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
         lambda r: rmp.RMPVICES(r, joint_limit=RMPflowJointLimit(r.q_lower, r.q_upper)),
         "RMPflow's joint limiter at its authors' values",
     ),
+    "rmp_vices_literal": (rmp.rmp_vices_literal, "the paper's formulas, no additions"),
     "paper_corrected": (
         lambda r: _paper(r, "corrected"),
         "the paper's leaves, signs corrected, RMPflow's joint limiter",

@@ -33,6 +33,7 @@ PARTS = (
     "self_collision",
     "joint_limit",
     "posture",
+    "yielding",
     "attractor_weight",
     "regularizer",
 )

@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 
 from envs.placement import LAYOUTS
-from rmp_mjx.control import RMPVICES, VICES
+from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.mjcf import unknown
 
-CONTROLLERS = {"rmp_vices": RMPVICES, "vices": VICES}
+CONTROLLERS = {
+    "rmp_vices": RMPVICES,
+    "vices": VICES,
+    "rmp_vices_literal": rmp_vices_literal,
+}
 """Controllers by name: each makes one for a robot."""
 
 CTRL_DT = 0.05

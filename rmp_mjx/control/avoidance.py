@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.obstacles import Gap, Obstacles
+from rmp_mjx.obstacles import Boxes, Capsules, Gap, Obstacles, Planes, Spheres
 from rmp_mjx.rmp import RMP, ScalarLeaf
 from rmp_mjx.robot.kinematics import (
     ArmState,
@@ -20,29 +22,49 @@ from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
 from rmp_mjx.vec import Vec, store, sum_all
 
+KINDS = {Spheres: "spheres", Planes: "planes", Capsules: "capsules", Boxes: "boxes"}
+"""Kinds of obstacles by name."""
+
+CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]
+"""A leaf for all obstacles, or one for each kind of `KINDS` (None: not avoided)."""
+
+
+def leaf_of(leaf: CollisionLeaf, kind: object) -> ScalarLeaf | None:
+    """The leaf that avoids obstacles of this kind."""
+    return leaf[KINDS[type(kind)]] if isinstance(leaf, Mapping) else leaf
+
+
+def per_link(robot: Robot, values: Float[ArrayLike, " n"]) -> Float[Array, " p"]:
+    """A leaf parameter for every control point from one for every link, (n,)."""
+    return jnp.asarray(values)[np.array(robot.points.segment, int)]
+
 
 def obstacle_branch(
-    robot: Robot, arm: ArmState, obstacles: Obstacles, leaf: ScalarLeaf
-) -> tuple[RMP, Float[Array, ""]]:
+    robot: Robot, arm: ArmState, obstacles: Obstacles, leaf: CollisionLeaf
+) -> tuple[RMP, dict[str, Float[Array, ""]]]:
     """Collision leaves between every control point and every obstacle.
 
     Distances are mapped to points (their RMPs summed over the obstacles, a 3-vector
     and a 3x3 matrix each), points to joints.
 
     Returns:
-        The RMP on the joints, and the least distance to an obstacle [m] (inf if none).
+        The RMP on the joints, and the least distance to each kind of obstacle there
+        are slots for [m] (inf if none is in use).
     """
     points = point_state(robot, arm)
     origin = base_point(robot)
     world = points.x + Vec(origin[0], origin[1], origin[2])
     rho = jnp.asarray(robot.points.radius, arm.p.dtype)
-    total, clearance = None, jnp.array(jnp.inf, arm.p.dtype)
+    total, clearance = None, {}
     for kind in obstacles.kinds:
         gap = kind.gap(world, points.v, rho)
-        rmp = _sum_obstacles(gap, leaf)
-        total = rmp if total is None else jax.tree.map(jnp.add, total, rmp)
-        nearest = jnp.min(jnp.where(gap.active, gap.distance, jnp.inf))
-        clearance = jnp.minimum(clearance, nearest)
+        clearance[KINDS[type(kind)]] = jnp.min(
+            jnp.where(gap.active, gap.distance, jnp.inf), initial=jnp.inf
+        )
+        own = leaf_of(leaf, kind)
+        if own is not None:
+            rmp = _sum_obstacles(gap, own)
+            total = rmp if total is None else jax.tree.map(jnp.add, total, rmp)
     if total is None or not robot.points.segment:
         return RMP.zero(robot.n, arm.p.dtype), clearance
     return pull_to_joints(robot, arm, points, total), clearance

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -12,9 +13,10 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.control.action import ActionRange, compose_setpoint
-from rmp_mjx.control.avoidance import obstacle_branch, self_branch
+from rmp_mjx.control.avoidance import KINDS, obstacle_branch, self_branch
 from rmp_mjx.control.torque import scale_torque
 from rmp_mjx.control.tree import rmp_vices_tree
+from rmp_mjx.control.yielding import Yielding
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
@@ -29,6 +31,7 @@ from rmp_mjx.robot.kinematics import (
     site_pose,
     site_state,
 )
+from rmp_mjx.robot.mjcf import unknown
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 from rmp_mjx.vec import store
@@ -54,17 +57,22 @@ class RMPVICES:
 
     robot: Robot
     """The arm."""
-    collision: ScalarLeaf | Any | None = ...
-    """Leaf between every control point and obstacle; its parameters may be arrays that
-    broadcast against (obstacles, points)."""
+    collision: ScalarLeaf | Mapping[str, ScalarLeaf | None] | Any | None = ...
+    """Leaf between every control point and obstacle, or one for each kind: `spheres`,
+    `planes`, `capsules`, `boxes` (None: not avoided; left out: the default). Parameters
+    may be arrays that broadcast against (obstacles, points): see `per_link`."""
     self_collision: ScalarLeaf | Any | None = ...
     """Leaf between the link capsules that can touch."""
     joint_limit: ScalarLeaf | Any | None = ...
     """Leaf on the joints."""
     posture: Posture | Any | None = ...
-    """Rest configuration, in the inertia metric: fills the null space."""
+    """Rest configuration, in the inertia metric: fills the null space. The default's
+    spring is soft, so that the hand can turn past obstacles, and overdamped."""
     attractor_weight: Float[Array, ""] | float = 1.0
     """Metric of the two impedance attractors."""
+    yielding: Yielding | Any | None = ...
+    """Weight of the orientation attractor beside spheres, capsules and boxes; a plane
+    cannot be gone round."""
     regularizer: Float[Array, ""] | float = 1e-3
     """The root's epsilon: damps accelerations that nothing asks for."""
     action_range: ActionRange = struct.field(default_factory=ActionRange)
@@ -83,11 +91,19 @@ class RMPVICES:
             "collision": collision_near,
             "self_collision": collision_near,
             "joint_limit": lambda: JointLimitBarrier(robot.q_lower, robot.q_upper),
-            "posture": lambda: Posture(q_0=robot.q_home),
+            "posture": lambda: Posture(q_0=robot.q_home, kq=2.5, kd=10.0),
+            "yielding": Yielding,
         }
         for name, make in defaults.items():
             if getattr(self, name) is ...:
                 object.__setattr__(self, name, make())
+        if isinstance(self.collision, Mapping):
+            kinds = tuple(KINDS.values())
+            for kind in self.collision:
+                if kind not in kinds:
+                    raise ValueError(unknown("kind of obstacle", kind, kinds))
+            leaves = dict.fromkeys(kinds, collision_near()) | dict(self.collision)
+            object.__setattr__(self, "collision", leaves)
 
     def decode(self, action: Float[Array, " 12"]) -> Action:
         """Physical units of a policy action in [-1, 1]^12."""
@@ -113,17 +129,19 @@ class RMPVICES:
             obstacles: Padded obstacle slots.
 
         Returns:
-            Torque, acceleration, root RMP and diagnostics: `torque_scale` in [0, 1] and
-            `clearance` [m], the least distance of a control point to an obstacle.
+            Torque, acceleration, root RMP and diagnostics: `torque_scale` in [0, 1],
+            `clearance` [m], the least distance of a control point to an obstacle, and
+            `orientation_weight` in [0, 1], what `yielding` leaves of the orientation.
         """
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
-        branches, clearance = self._avoidance(arm, obstacles)
+        branches, clearance, yielded = self._avoidance(arm, obstacles)
         if self.jacobian == "autodiff":
-            tree = rmp_vices_tree(self, setpoint, obstacles, Mq)
+            tree = rmp_vices_tree(self, setpoint, obstacles, Mq, yielded)
             root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
         else:
-            branches += self._impedance(site_state(self.robot, arm), setpoint)
+            site = site_state(self.robot, arm)
+            branches += self._impedance(site, setpoint, yielded)
             if self.joint_limit is not None:
                 branches.append(self.joint_limit(q, qd))
             if self.posture is not None:
@@ -137,15 +155,21 @@ class RMPVICES:
             qdd=qdd,
             f=root.f,
             M=root.M,
-            diagnostics={"torque_scale": scale, "clearance": clearance},
+            diagnostics={
+                "torque_scale": scale,
+                "clearance": clearance,
+                "orientation_weight": yielded,
+            },
         )
 
-    def _impedance(self, site: SiteState, setpoint: Setpoint) -> list[RMP]:
+    def _impedance(
+        self, site: SiteState, setpoint: Setpoint, yielded: Float[Array, ""]
+    ) -> list[RMP]:
         """The two attractors of the end effector, pulled back to the joints."""
         weight = self.attractor_weight
         position = PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight)
         orientation = orientation_attractor(
-            site.R, site.w, setpoint.R_des, setpoint.kp_ori, weight=weight
+            site.R, site.w, setpoint.R_des, setpoint.kp_ori, weight=weight * yielded
         )
         return [
             pullback(position(site.p, site.v), site.J_pos, site.Jdot_qd_pos),
@@ -154,12 +178,18 @@ class RMPVICES:
 
     def _avoidance(
         self, arm: ArmState, obstacles: Obstacles
-    ) -> tuple[list[RMP], Float[Array, ""]]:
-        """The collision branches on the joints, and the clearance."""
-        branches, clearance = [], jnp.array(jnp.inf, arm.p.dtype)
+    ) -> tuple[list[RMP], Float[Array, ""], Float[Array, ""]]:
+        """The collision branches on the joints, the clearance, the yielded weight."""
+        branches, nearest = [], {}
         if self.collision is not None:
-            rmp, clearance = obstacle_branch(self.robot, arm, obstacles, self.collision)
+            rmp, nearest = obstacle_branch(self.robot, arm, obstacles, self.collision)
             branches.append(rmp)
         if self.self_collision is not None:
             branches.append(self_branch(self.robot, arm, self.self_collision))
-        return branches, clearance
+        infinite = jnp.array(jnp.inf, arm.p.dtype)
+        clearance = functools.reduce(jnp.minimum, nearest.values(), infinite)
+        bodies = [d for kind, d in nearest.items() if kind != "planes"]
+        if self.yielding is None or not bodies:
+            return branches, clearance, jnp.ones_like(infinite)
+        yielded = self.yielding(functools.reduce(jnp.minimum, bodies))
+        return branches, clearance, yielded

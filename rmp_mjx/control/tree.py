@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rmp_mjx.control.avoidance import CollisionLeaf, leaf_of
 from rmp_mjx.math import exp_so3, safe_norm
-from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.obstacles import Boxes, Capsules, Obstacles, Planes, Spheres
 from rmp_mjx.rmp import RMP, Leaf, Node, ScalarLeaf, Siblings, TaskMap, identity_map
 from rmp_mjx.rmp.leaves.attractor import OrientationAttractor, PositionAttractor
 from rmp_mjx.rmp.leaves.posture import Posture
@@ -28,7 +29,11 @@ if TYPE_CHECKING:
 
 
 def rmp_vices_tree(
-    ctrl: RMPVICES, setpoint: Setpoint, obstacles: Obstacles, Mq: Float[Array, "n n"]
+    ctrl: RMPVICES,
+    setpoint: Setpoint,
+    obstacles: Obstacles,
+    Mq: Float[Array, "n n"],
+    yielded: Float[Array, ""],
 ) -> Node:
     """The controller's tree with the joints at its root (the paper's figure 2).
 
@@ -37,8 +42,10 @@ def rmp_vices_tree(
         setpoint: Impedance target.
         obstacles: Obstacle slots.
         Mq: Inertia, the metric of the posture leaf.
+        yielded: Weight of the edge to the orientation attractor, in this state.
     """
     robot, weight = ctrl.robot, ctrl.attractor_weight
+    turning = weight * yielded
     children: list[Node | Siblings | Leaf] = [
         Node(
             TaskMap(lambda q: site_pose(robot, q)[0]),
@@ -46,7 +53,7 @@ def rmp_vices_tree(
         ),
         Node(
             TaskMap(lambda q: site_pose(robot, q)[1]),
-            (OrientationAttractor(setpoint.R_des, setpoint.kp_ori, weight=weight),),
+            (OrientationAttractor(setpoint.R_des, setpoint.kp_ori, weight=turning),),
         ),
     ]
     if ctrl.joint_limit is not None:
@@ -89,7 +96,7 @@ class Masked(Leaf):
         return RMP(f=rmp.f * self.active, M=rmp.M * self.active)
 
 
-def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: ScalarLeaf) -> Siblings:
+def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: CollisionLeaf) -> Siblings:
     """Control points as siblings, each with one sibling per obstacle slot."""
     points = robot.points
     one_hot = np.arange(robot.n)[None] == np.array(points.segment)[:, None]
@@ -99,30 +106,30 @@ def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: ScalarLeaf) -> Siblin
         p, R = forward_kinematics(robot, q)
         return base_point(robot) + (p + jnp.einsum("ijn,j->in", R, offset)) @ link
 
-    def node(offset, link, radius):
+    def node(k):
         siblings = []
-        for kind, distance in (
-            (obstacles.spheres, _sphere),
-            (obstacles.planes, _plane),
-            (obstacles.capsules, _capsule),
-            (obstacles.boxes, _box),
-        ):
-            slots = kind.active.shape[0]
-            if not slots:
+        for kind in obstacles.kinds:
+            own = leaf_of(leaf, kind)
+            if own is None:
                 continue
+            slots = kind.active.shape[0]
             params, rates = _moving(kind)
-            params["rho"] = jnp.full(slots, radius)
+            params["rho"] = jnp.full(slots, points.radius[k])
             rates["rho"] = jnp.zeros(slots)
             active = jnp.asarray(kind.active, jnp.result_type(float))[:, None]
-            child = Node(TaskMap(distance, params, rates), (Masked(leaf, active),))
-            siblings.append(Siblings(child))
+            masked = Masked(_at_point(own, (slots, len(one_hot)), k), active)
+            distance = TaskMap(DISTANCE[type(kind)], params, rates)
+            siblings.append(Siblings(Node(distance, (masked,))))
+        offset = jnp.asarray(points.offset[k])
+        link = jnp.asarray(one_hot[k], offset.dtype)
         return Node(TaskMap(position, (offset, link)), tuple(siblings))
 
-    nodes = [
-        node(jnp.asarray(o), jnp.asarray(h, o.dtype), r)
-        for o, h, r in zip(points.offset, one_hot, points.radius, strict=True)
-    ]
-    return Siblings.stack(nodes)
+    return Siblings.stack([node(k) for k in range(len(one_hot))])
+
+
+def _at_point(leaf: ScalarLeaf, shape: tuple[int, int], k: int) -> ScalarLeaf:
+    """The leaf of control point k, its parameters one for each obstacle slot."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape)[:, k], leaf)
 
 
 def _moving(kind: Any) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -156,6 +163,10 @@ def _box(o: dict[str, Array], x: Array) -> Array:
     over = jnp.abs(r) - o["half_size"]
     outside = safe_norm(jnp.maximum(over, 0.0))
     return outside + jnp.minimum(jnp.max(over), 0.0) - o["radius"] - o["rho"]
+
+
+DISTANCE = {Spheres: _sphere, Planes: _plane, Capsules: _capsule, Boxes: _box}
+"""Distance map of each kind of obstacle."""
 
 
 def _self_node(robot: Robot, leaf: ScalarLeaf) -> Node:

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx import RMPVICES, Node, Siblings
+from rmp_mjx import RMPVICES, Node, Siblings, per_link
 from rmp_mjx.control.tree import rmp_vices_tree
+from rmp_mjx.rmp.leaves import GDSCollision, collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 from tests.control.conftest import QUICK
@@ -27,18 +28,54 @@ def fast(run64, ctrl, inputs):
     return run64(ctrl, *inputs)
 
 
-def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, fast):
+@pytest.fixture(scope="module")
+def varied(robot):
+    """A leaf for each kind of obstacle, one of them other for each link."""
+    near = collision_near()
+    return {
+        "spheres": collision_transit(),
+        "planes": near.replace(margin=per_link(robot, 5e-3 * np.arange(7.0))),
+        "capsules": None,
+        "boxes": GDSCollision(mu=1e-3, eps=0.1, r=0.3, cap=1e3),
+    }
+
+
+def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, varied):
     """500 states, all kinds of obstacles moving and turning, in contact or near.
 
     1e-9 of the largest entry: rounding of metrics that span 1e6. The acceleration gets
     the root's condition on top: 1e-7 of its largest entry.
     """
-    slow = run64(RMPVICES(robot, jacobian="autodiff"), *inputs)
+    fast = run64(RMPVICES(robot, varied), *inputs)
+    slow = run64(RMPVICES(robot, varied, jacobian="autodiff"), *inputs)
     assert np.quantile(fast.diagnostics["clearance"], [0.1, 0.9]).tolist() < [0.0, 0.2]
+    assert np.ptp(fast.diagnostics["orientation_weight"]) > 0.9
     for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("qdd", 1e-7), ("tau", 1e-7)):
         a, b = (getattr(out, name).reshape(len(inputs[0]), -1) for out in (fast, slow))
         scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
         assert np.max(np.abs(a - b) / scale) < tolerance, name
+
+
+def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):
+    """To rounding: 1e-9 of the largest entry."""
+    near, n = collision_near(), len(robot.points.segment)
+    each = {"boxes": near, "planes": near.replace(mu=np.full(n, near.mu))}
+    split = RMPVICES(robot, each)
+    assert split.collision["spheres"] == near
+    for k in range(3):
+        q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
+        with jax.enable_x64(True):
+            out = jax.device_get(
+                split(q, qd, split.setpoint(q, split.decode(action)), obstacles)
+            )
+        np.testing.assert_allclose(
+            out.M, fast.M[k], rtol=0, atol=1e-9 * np.abs(fast.M[k]).max()
+        )
+
+
+def test_unknown_kind_of_obstacle_is_refused(robot):
+    with pytest.raises(ValueError, match="spheres, planes, capsules, boxes"):
+        RMPVICES(robot, {"sphere": collision_near()})
 
 
 def _coordinates(node, x, t):
@@ -63,7 +100,8 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
     def leaf_terms(ctrl, q, qd, action, obstacles):
         Mq, _ = dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))
         setpoint = ctrl.setpoint(q, ctrl.decode(action))
-        tree = rmp_vices_tree(ctrl, setpoint, obstacles, Mq)
+        yielded = ctrl(q, qd, setpoint, obstacles).diagnostics["orientation_weight"]
+        tree = rmp_vices_tree(ctrl, setpoint, obstacles, Mq, yielded)
 
         def values(q, t):
             return [y for _, y in _coordinates(tree, q, t)]
@@ -117,6 +155,7 @@ def test_every_branch_matters(run64, ctrl, inputs, fast):
         ("collision", {"mu": 1e-9}),
         ("self_collision", {"mu": 1.0}),
         ("posture", {"kq": 1.0}),
+        ("yielding", {"least": 0.5}),
     ):
         leaf = dataclasses.replace(getattr(ctrl, field), **change)
         out = run64(ctrl.replace(**{field: leaf}), *inputs)

@@ -134,6 +134,31 @@ def test_barrier_is_its_formula():
     np.testing.assert_allclose(f / metric, 10 + xd**2 / 5e-3 + 100 * 0.1, rtol=1e-5)
 
 
+def test_barrier_lets_a_leaving_body_go_over_its_release_speed():
+    """The metric at rest times exp(-xd / v_out), pushing nowhere; 1e-5: float32."""
+    leaf = leaves.Barrier(mu=0.01, eps=0.2, r=1.0, margin=0.12, v_out=3e-3)
+    xd = jnp.asarray([0.0, 3e-3, 9e-3, 0.3])
+    f, m = leaf.scalar(jnp.full(4, 0.42), xd)
+    at_rest = 0.01 * 0.7**2 * 0.2 / 0.3**4
+    np.testing.assert_allclose(m[:3], at_rest * np.exp([0.0, -1.0, -3.0]), rtol=1e-5)
+    assert m[3] < 1e-30
+    assert not np.any(np.asarray(f))
+
+
+def test_barrier_does_not_throw_a_drifting_body_inwards():
+    """One control step of 5 ms under the largest push, drifting off at 1 mm/s.
+
+    Let go at once the body would enter at 0.13 m/s, with nothing to stop it that step.
+    """
+
+    def next_speed(leaf, xd=1e-3, push=26.0):
+        f, m = leaf.scalar(jnp.asarray(0.01), jnp.asarray(xd))
+        return float(xd + 5e-3 * (f - push) / (m + 1.0))
+
+    assert next_speed(leaves.collision_near()) > 0.0
+    assert next_speed(leaves.collision_near().replace(v_out=1e-9)) < -0.1
+
+
 def test_paper_leaf_has_both_sign_conventions():
     x, xd = jnp.full(2, 0.1), jnp.asarray([-0.5, 0.5])
     f, m = leaves.PaperCollision(eta=2.0).scalar(x, xd)
@@ -205,6 +230,11 @@ def _push(leaf, distance=0.2, push=15.0, dt=2e-3, seconds=10.0):
 @pytest.mark.parametrize("name", ["transit", "near"])
 def test_barrier_stops_a_steadily_pushed_mass_before_contact(name):
     assert _push(DISTANCE_LEAVES[name]) > 0.0
+
+
+def test_pushed_mass_creeps_through_the_papers_leaf():
+    """Its metric vanishes with the speed: in time a steady push always wins."""
+    assert _push(DISTANCE_LEAVES["paper"], seconds=60.0) < 0.0
 
 
 def test_pushed_mass_goes_through_without_a_barrier_and_with_the_printed_signs():

@@ -13,17 +13,23 @@ from rmp_mjx.rmp.leaf import ScalarLeaf
 class Barrier(ScalarLeaf):
     r"""Velocity-gated barrier on a signed distance ``d`` with speed ``xd = dd/dt``.
 
-    With :math:`x = \max(d - \text{margin}, x_\min)` and :math:`x < r`:
+    With :math:`x = \max(d - \text{margin}, x_\min)`, the approach
+    :math:`v = \min(\dot x, 0)` and :math:`h = \exp(-\max(\dot x, 0) / v_\text{out})`,
+    for :math:`x < r`:
 
     .. math::
-        m &= \min\bigl(\mu (1 - x/r)^2 (\min(\dot x, 0)^2
-             + \epsilon [\dot x < 0]) / x^4,\ \text{cap}\bigr) \\
-        a &= -\eta \dot x + \dot x^2 / x + k_{out} \max(\text{margin} - d, 0) \\
+        m &= h \min\bigl(\mu (1 - x/r)^2 (v^2 + \epsilon) / x^4,\ \text{cap}\bigr) \\
+        a &= -\eta v + v^2 / x + k_{out} \max(\text{margin} - d, 0) \\
         f &= m a
 
-    and exactly zero otherwise. The :math:`\dot x^2 / x` term is the geodesic
-    curvature of the metric :math:`\dot x^2 / x^4`; ``eps`` keeps a slowly creeping
-    approach heavy. Explicit integration of the damping needs ``eta * dt < 2``.
+    and exactly zero otherwise. The :math:`v^2 / x` term is the geodesic curvature of
+    the metric :math:`v^2 / x^4`; ``eps`` keeps a slowly creeping approach heavy.
+
+    A body that leaves is let go over the speed ``v_out``. To let go at once, at
+    :math:`\dot x = 0`, makes a ratchet: when a body that is pushed against the barrier
+    drifts off it, the metric is gone for one control step, the push throws the body
+    inwards, and each time it stops a little closer. Explicit integration of the damping
+    needs ``eta * dt < 2``.
 
     Source: the collision leaf of Shaw et al., "RMPs for Safe Impedance Control in
     Contact-Rich Manipulation" (2021), signs corrected, with the GDS curvature of
@@ -33,7 +39,7 @@ class Barrier(ScalarLeaf):
     mu: Float[Array, ""] | float = 1e-3
     """Metric scale, [unit^2 s^2]."""
     eps: Float[Array, ""] | float = 0.2
-    """Velocity floor of the metric while approaching, [unit^2/s^2]."""
+    """Velocity floor of the metric, [unit^2/s^2]."""
     eta: Float[Array, ""] | float = 20.0
     """Damping, [1/s]."""
     r: Float[Array, ""] | float = 0.3
@@ -45,7 +51,9 @@ class Barrier(ScalarLeaf):
     cap: Float[Array, ""] | float = 1e3
     """Largest metric."""
     k_out: Float[Array, ""] | float = 100.0
-    """Outward stiffness inside the margin, [1/s^2], active while approaching."""
+    """Outward stiffness inside the margin, [1/s^2]."""
+    v_out: Float[Array, ""] | float = 3e-3
+    """Speed over which a leaving body is let go, [unit/s], > 0."""
 
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
@@ -60,13 +68,14 @@ class Barrier(ScalarLeaf):
             Natural force ``f`` and metric ``m``, shaped like ``x``.
         """
         gap = jnp.maximum(x - self.margin, self.x_min)
-        active = (gap < self.r) & (xd < 0)
+        active = gap < self.r
         gap = jnp.where(active, gap, 1.0)
         depth = jnp.where(active, jnp.maximum(self.margin - x, 0.0), 0.0)
-        v = jnp.where(active, xd, 0.0)
+        v = jnp.where(active, jnp.minimum(xd, 0.0), 0.0)
+        hold = jnp.where(active, jnp.exp(-jnp.maximum(xd, 0.0) / self.v_out), 0.0)
         fade = 1.0 - gap / self.r
         inverse2 = 1.0 / (gap * gap)
         m = self.mu * (fade * inverse2) ** 2 * (v * v + self.eps)
-        m = jnp.where(active, jnp.minimum(m, self.cap), 0.0)
+        m = hold * jnp.minimum(m, self.cap)
         a = -self.eta * v + v * v / gap + self.k_out * depth
         return m * a, m

@@ -1,0 +1,35 @@
+"""How the orientation yields to obstacles, so that the hand can turn past them."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+
+@struct.dataclass
+class Yielding:
+    r"""Weight of the orientation attractor beside an obstacle of clearance c.
+
+    .. math:: h = h_{least}^{\,s}, \quad
+        s = \mathrm{clip}\Bigl(\frac{c_{far} - c}{c_{far} - c_{near}}, 0, 1\Bigr)
+
+    The identity metrics of the two attractors weigh 1 rad/s^2 like 1 m/s^2, so a hand
+    that meets an obstacle would rather stop than turn by a degree. With ``least`` the
+    square of a hand's length a turn counts as far as it moves the hand's other end, and
+    the reaction of the collision leaves turns the hand out of the way.
+
+    A state-dependent edge weight of the tree, as in RMPfusion (Li et al., 2019).
+    """
+
+    least: Float[Array, ""] | float = 0.01
+    """Weight at the obstacle, [m^2/rad^2], > 0; 1 holds the orientation everywhere."""
+    near: Float[Array, ""] | float = 0.02
+    """Clearance up to which the weight is ``least``, [m]."""
+    far: Float[Array, ""] | float = 0.08
+    """Clearance from which on the weight is 1, [m]."""
+
+    def __call__(self, clearance: Float[Array, ""]) -> Float[Array, ""]:
+        """The weight at a clearance [m]; 1 if that is infinite."""
+        share = (self.far - clearance) / (self.far - self.near)
+        return jnp.asarray(self.least, clearance.dtype) ** jnp.clip(share, 0.0, 1.0)
