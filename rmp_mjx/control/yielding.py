@@ -31,5 +31,6 @@ class Yielding:
 
     def __call__(self, clearance: Float[Array, ""]) -> Float[Array, ""]:
         """The weight at a clearance [m]; 1 if that is infinite."""
-        share = (self.far - clearance) / (self.far - self.near)
-        return jnp.asarray(self.least, clearance.dtype) ** jnp.clip(share, 0.0, 1.0)
+        inside = self.far - jnp.minimum(clearance, self.far)  # finite gradients at inf
+        share = jnp.minimum(inside / (self.far - self.near), 1.0)
+        return jnp.asarray(self.least, clearance.dtype) ** share

@@ -92,7 +92,10 @@ def test_switched_off_obstacles_are_no_obstacles(run64, ctrl, inputs):
         }
     )
     out = run64(ctrl, q, qd, action, off)
-    weightless = ctrl.replace(collision=ctrl.collision.replace(mu=0.0))
+    weightless = ctrl.replace(
+        collision=ctrl.collision.replace(mu=0.0),
+        yielding=ctrl.yielding.replace(least=1.0),
+    )
     np.testing.assert_array_equal(out.tau, run64(weightless, *inputs).tau)
     assert np.all(np.isinf(out.diagnostics["clearance"]))
 

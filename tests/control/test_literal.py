@@ -12,6 +12,8 @@ from tests.robot.test_model import GRIPPER
 
 Q, QD = np.array([0.1, 0.5, -0.3]), np.array([0.4, -0.2, 0.3])
 ACTION = np.full(12, 0.3)
+FAR = [1e4, 0.0, 0.0]
+"""The leaf has no range: its metric falls with the fourth power of the distance."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def act(literal):
 
 def test_far_from_everything_the_root_is_attractors_and_limiter(act):
     """1e-12: rounding. The limiter stands on the limited joints' diagonal alone."""
-    out, site, _, limiter = act(QD, [5.0, 5.0, 5.0])
+    out, site, _, limiter = act(QD, FAR)
     rest = out.M - site.J_pos.T @ site.J_pos - site.J_ori.T @ site.J_ori
     np.testing.assert_allclose(rest, np.diag(limiter), atol=1e-12)
     np.testing.assert_array_equal(limiter > 0, [False, True, False])
@@ -50,7 +52,7 @@ def test_far_from_everything_the_root_is_attractors_and_limiter(act):
 
 def test_obstacle_weighs_nothing_at_rest_however_near(act):
     """Why a slow push wins: the metric vanishes with the speed."""
-    near, far = ([0.3, 0.0, 0.4], [5.0, 5.0, 5.0])
+    near, far = [0.3, 0.0, 0.4], FAR
     still = np.zeros(3)
     assert act(still, near)[0].diagnostics["clearance"] < 0.1
     np.testing.assert_array_equal(act(still, near)[0].M, act(still, far)[0].M)
@@ -60,7 +62,7 @@ def test_obstacle_weighs_nothing_at_rest_however_near(act):
 
 def test_acceleration_is_the_roots_up_to_its_regulariser(literal, act):
     """`REGULARIZER` Mq against a root of order one."""
-    out, _, Mq, _ = act(QD, [5.0, 5.0, 5.0])
+    out, _, Mq, _ = act(QD, FAR)
     np.testing.assert_allclose(
         (out.M + literal.regularizer * Mq) @ out.qdd, out.f, rtol=1e-6, atol=1e-6
     )
