@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from scipy import stats
 
 import rmp_mjx as rmp
@@ -56,6 +57,7 @@ def _off(robot: rmp.Robot) -> rmp.RMPVICES:
     return rmp.RMPVICES(robot, off, off, limits)
 
 
+@struct.dataclass
 class _NoCurvature(Barrier):
     """The barrier without its geodesic term."""
 
