@@ -15,8 +15,9 @@ from jax import Array
 
 import envs
 from benchmarks.policies import POLICIES, View
-from envs.base import ArmEnv, State
+from envs.base import ArmEnv
 from envs.spheres import AWAY
+from envs.types import State
 from rmp_mjx import RMPVICES, VICES
 from rmp_mjx.vec import xyz
 

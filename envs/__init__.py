@@ -7,10 +7,10 @@ from typing import Any
 
 from envs import options as _options
 from envs.base import ArmEnv as ArmEnv
-from envs.base import State as State
 from envs.door import Door
 from envs.push import Push
 from envs.trajectory import Trajectory
+from envs.types import State as State
 from rmp_mjx.robot.mjcf import unknown
 
 ENVS: dict[str, type[ArmEnv]] = {task.name: task for task in (Trajectory, Door, Push)}

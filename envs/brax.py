@@ -8,7 +8,8 @@ from brax.envs.base import Env
 from brax.envs.base import State as BraxState
 from jaxtyping import Array, Float
 
-from envs.base import ArmEnv, State
+from envs.base import ArmEnv
+from envs.types import State
 
 
 class BraxTask(Env):

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs import options
-from envs.base import ArmEnv, Entry, Score
+from envs.base import ArmEnv
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, Contacts
+from envs.types import Entry, Score
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot.kinematics import SiteState

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs import options
-from envs.base import ArmEnv, Entry, Score
+from envs.base import ArmEnv
 from envs.placement import CANDIDATES
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
+from envs.types import Entry, Score
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
 
@@ -30,6 +31,10 @@ BLOCK_LOW, BLOCK_HIGH = np.array([0.42, -0.10]), np.array([0.52, 0.10])
 
 GOAL_LOW, GOAL_HIGH = np.array([0.38, -0.26]), np.array([0.58, 0.26])
 """Corners of the area where the goal may be [m]."""
+
+BEHIND = 0.045
+"""Where the hand belongs: this far behind the block's centre, seen from the goal [m].
+The finger touches the block at 5.2 cm, so a hand on its way there pushes."""
 
 HAND_ROOM = 0.085
 """Distance behind the block's centre that is kept clear for the hand [m]."""
@@ -48,13 +53,14 @@ class PushOptions(options.Options):
     """Mass of the block [kg]."""
     block_friction: float = 0.5
     """Sliding friction of the block on the table and on the hand."""
-    reward_slope: float = 5.0
-    """Slope k of the rewards ``1 - tanh(k d)`` [1/m]; the paper's is 20."""
+    guided: bool = True
+    """Reward the hand for being where it pushes the block towards the goal, and tell
+    the policy where that is; `False`: the paper's reward and observation."""
 
     def __post_init__(self):
         """Check the values."""
         super().__post_init__()
-        for name in ("block_mass", "block_friction", "reward_slope"):
+        for name in ("block_mass", "block_friction"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
@@ -62,8 +68,9 @@ class PushOptions(options.Options):
 class Push(ArmEnv):
     """Push the block to within 5 cm of the goal, and keep it there.
 
-    Reward in every step, with the distances h of grip and block, and g of block and
-    goal: ``3 (1 - tanh k h) + 10 (1 - tanh k g)``; an event costs `event_penalty`.
+    Reward in every step, with the distances h of the grip to its place behind the block
+    (`guided=False`: to the block) and g of the block to the goal:
+    ``5 (1 - tanh 20 h) + 50 (1 - tanh 20 g)``; an event costs `event_penalty`.
     The block alone may be touched, by the hand alone.
     """
 
@@ -72,17 +79,22 @@ class Push(ArmEnv):
     q_start = np.array([3.152, 3.878, -0.009, 1.317, 0.065, 3.708, 3.147])
     sphere_box = (np.array([0.32, -0.28, -0.05]), np.array([0.60, 0.28, 0.20]))
     task_metrics: ClassVar[dict[str, str]] = {"goal_distance": "last"}
-    hand_reward = 3.0
-    goal_reward = 10.0
+    hand_reward, goal_reward = 5.0, 50.0
+    slope = 20.0
+    """Slope of the rewards ``1 - tanh(slope d)`` [1/m]."""
     reach = 0.05
     """The block counts as pushed home within this distance of the goal [m]."""
 
     @property
     def task_entries(self) -> tuple[Entry, ...]:
-        """The block from the grip, the goal from the block."""
+        """The block from the grip, the goal from the block, the way to push."""
+        place = Entry(
+            "hand_to_place", 3, "m", "where it is to be pushed, from the grip"
+        )
         return (
             Entry("hand_to_block", 3, "m", "block's centre from the grip"),
             Entry("block_to_goal", 3, "m", "goal from the block's centre"),
+            *((place,) if self.options.guided else ()),
         )
 
     def objects(self, spec: mujoco.MjSpec) -> Contacts:
@@ -120,6 +132,11 @@ class Push(ArmEnv):
         n = self.robot.n
         return data.qpos[n : n + 3]
 
+    def place(self, block: Array, goal: Array) -> Float[Array, " 3"]:
+        """Where the hand belongs while it pushes the block to its goal [m]."""
+        way = goal - block
+        return block - BEHIND * way / jnp.maximum(jnp.linalg.norm(way), 1e-6)
+
     def keep_clear(self, task: dict[str, Array]) -> Float[Array, "v 3"]:
         """The block's top all along its straight way, and room behind it for the hand.
 
@@ -145,18 +162,21 @@ class Push(ArmEnv):
         task: dict[str, Array],
         step: Array,
     ) -> Score:
-        """Reward the hand for nearing the block, and the block for nearing the goal."""
-        block = self.block(data)
-        hand = jnp.linalg.norm(block - site.p)
-        goal = jnp.linalg.norm(task["goal"] - block)
-        slope = self.options.reward_slope
-        reward = self.hand_reward * (1.0 - jnp.tanh(slope * hand))
-        reward += self.goal_reward * (1.0 - jnp.tanh(slope * goal))
-        return Score(task, reward, goal < self.reach, {"goal_distance": goal})
+        """Reward the hand for being in its place, the block for nearing the goal."""
+        block, goal = self.block(data), task["goal"]
+        place = self.place(block, goal) if self.options.guided else block
+        hand, left = (jnp.linalg.norm(x) for x in (place - site.p, goal - block))
+        reward = self.hand_reward * (1.0 - jnp.tanh(self.slope * hand))
+        reward += self.goal_reward * (1.0 - jnp.tanh(self.slope * left))
+        return Score(task, reward, left < self.reach, {"goal_distance": left})
 
     def observe(
         self, data: PhysicsState, site: SiteState, task: dict[str, Array]
     ) -> dict[str, Array]:
-        """Hand to block, block to goal."""
-        block = self.block(data)
-        return {"hand_to_block": block - site.p, "block_to_goal": task["goal"] - block}
+        """Hand to block, block to goal, hand to its place."""
+        block, goal = self.block(data), task["goal"]
+        return {
+            "hand_to_block": block - site.p,
+            "block_to_goal": goal - block,
+            "hand_to_place": self.place(block, goal) - site.p,
+        }

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from envs.base import ArmEnv, State
+from envs.base import ArmEnv
 from envs.scene import TABLE_HEIGHT
+from envs.types import State
 
 SIZE = (480, 640)
 """Height and width of a frame [pixels]."""

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs import options
-from envs.base import ArmEnv, Entry, Score
+from envs.base import ArmEnv
 from envs.placement import sample_apart
 from envs.safety import SafetyRecord
+from envs.types import Entry, Score
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
 

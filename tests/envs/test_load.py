@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import METRICS
 from envs.options import substeps
+from envs.types import METRICS
 
 
 def test_an_unknown_task_lists_the_tasks_and_suggests_one():
