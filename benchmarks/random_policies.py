@@ -44,17 +44,25 @@ NEAR = 0.05
 """A clearance below this counts as near an obstacle [m]."""
 
 
+HOLDING = rmp.Yielding(least=1.0)
+"""The orientation never yields."""
+
+
 def _paper(robot: rmp.Robot, signs: str) -> rmp.RMPVICES:
     leaf = PaperCollision(signs=signs)
     limits = RMPflowJointLimit(robot.q_lower, robot.q_upper)
-    return rmp.RMPVICES(robot, leaf, leaf, limits)
+    return rmp.RMPVICES(
+        robot, leaf, leaf, limits, yielding=HOLDING, limit_yielding=HOLDING
+    )
 
 
 def _off(robot: rmp.Robot) -> rmp.RMPVICES:
     """No safety leaf: a barrier of no weight, which shares the compiled program."""
     off = Barrier(mu=0.0)
     limits = JointLimitBarrier(robot.q_lower, robot.q_upper, off)
-    return rmp.RMPVICES(robot, off, off, limits)
+    return rmp.RMPVICES(
+        robot, off, off, limits, yielding=HOLDING, limit_yielding=HOLDING
+    )
 
 
 @struct.dataclass
@@ -100,8 +108,12 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
     "rmp_vices": (rmp.RMPVICES, "defaults"),
     "transit": (_transit, "collision leaf for moving among obstacles"),
     "holding_orientation": (
-        lambda r: rmp.RMPVICES(r, yielding=rmp.Yielding(least=1.0)),
+        lambda r: rmp.RMPVICES(r, yielding=HOLDING),
         "orientation does not yield beside obstacles",
+    ),
+    "holding_orientation_at_limits": (
+        lambda r: rmp.RMPVICES(r, limit_yielding=HOLDING),
+        "orientation does not yield near joint limits",
     ),
     "letting_go_at_once": (
         _collision(v_out=1e-9),

@@ -35,6 +35,7 @@ PARTS = (
     "joint_limit",
     "posture",
     "yielding",
+    "limit_yielding",
     "attractor_weight",
     "regularizer",
 )

@@ -26,6 +26,7 @@ from benchmarks.common import Row, show, write_json
 from benchmarks.random_policies import REACHING_LIMIT, poisson
 from benchmarks.safety_study import Group, Study
 from rmp_mjx import runtime
+from rmp_mjx.control.yielding import Yielding, limit_yielding
 from rmp_mjx.rmp.leaves import JointLimitBarrier, Posture
 from rmp_mjx.rmp.leaves.collision import collision_near
 from rmp_mjx.rmp.leaves.joint_limit import joint_limit_barrier
@@ -74,8 +75,20 @@ class Parameters:
     """Joint limits: metric scale."""
     limit_margin: float = 0.12
     """Joint limits: margin [rad]."""
+    limit_r: float = 0.5
+    """Joint limits: range [rad]."""
+    kq: float = 2.5
+    """Posture: stiffness [1/s^2]."""
     posture: float = 0.02
     """Posture: weight."""
+    least: float = 0.01
+    """Yielding: weight of the orientation at an obstacle."""
+    far: float = 0.08
+    """Yielding: clearance at which it begins [m]."""
+    limit_least: float = 0.01
+    """Yielding near joint limits: weight of the orientation at a limit."""
+    limit_far: float = 1.2
+    """Yielding near joint limits: distance at which it begins [rad]."""
 
     @staticmethod
     def suggest(trial: optuna.Trial) -> Parameters:
@@ -88,7 +101,13 @@ class Parameters:
             margin=trial.suggest_float("margin", 0.002, 0.02),
             limit_mu=trial.suggest_float("limit_mu", 1e-3, 1e-1, log=True),
             limit_margin=trial.suggest_float("limit_margin", 0.105, 0.16),
+            limit_r=trial.suggest_float("limit_r", 0.15, 1.0, log=True),
+            kq=trial.suggest_float("kq", 0.3, 10.0, log=True),
             posture=trial.suggest_float("posture", 0.002, 0.05, log=True),
+            least=trial.suggest_float("least", 1e-3, 0.1, log=True),
+            far=trial.suggest_float("far", 0.04, 0.2, log=True),
+            limit_least=trial.suggest_float("limit_least", 1e-3, 0.1, log=True),
+            limit_far=trial.suggest_float("limit_far", 0.3, 2.0, log=True),
         )
 
     def controller(self, robot: rmp.Robot) -> rmp.RMPVICES:
@@ -97,14 +116,18 @@ class Parameters:
             mu=self.mu, eps=self.eps, eta=self.eta, r=self.r, margin=self.margin
         )
         barrier = joint_limit_barrier().replace(
-            mu=self.limit_mu, margin=self.limit_margin
+            mu=self.limit_mu, margin=self.limit_margin, r=self.limit_r
         )
         return rmp.RMPVICES(
             robot,
             collision=collision,
             self_collision=collision,
             joint_limit=JointLimitBarrier(robot.q_lower, robot.q_upper, barrier),
-            posture=Posture(robot.q_home, kq=2.5, kd=10.0, weight=self.posture),
+            posture=Posture(robot.q_home, kq=self.kq, kd=10.0, weight=self.posture),
+            yielding=Yielding(least=self.least, far=self.far),
+            limit_yielding=limit_yielding().replace(
+                least=self.limit_least, far=self.limit_far
+            ),
         )
 
 
@@ -152,6 +175,7 @@ class Bench:
             if scene.name == "fixed":
                 groups.append(Group("straight", worlds, None, REACHING_LIMIT))
                 groups.append(Group("straight", worlds, "far", REACHING_LIMIT))
+                groups.append(Group("straight", worlds, "close", REACHING_LIMIT))
             self.studies[scene.name] = Study(
                 kind, groups, steps, task=scene.task, armature=armature, **scene.options
             )
@@ -164,7 +188,7 @@ class Bench:
             seed: Of everything random.
         """
         tallies: dict[str, Tally] = {}
-        reach: dict[str, list[float]] = {"targets": [], "missed": [], "steps": []}
+        steps_free, reached = float("nan"), {}
         for name, study in self.studies.items():
             controller = study.env.controller
             if parameters is not None:
@@ -178,16 +202,11 @@ class Bench:
                 solved = figures["success"] > 0
                 missed = figures["over"] & ~solved
                 if group.layout is None:
-                    reach["steps"].append(float(figures["age"][solved].mean() / 4))
+                    steps_free = float(figures["age"][solved].mean() / 4)
                 else:
-                    reach["targets"].append(float(figures["via_points"].sum()))
-                    reach["missed"].append(float(missed.sum()))
-        targets, missed = sum(reach["targets"]), sum(reach["missed"])
-        return {
-            "tallies": tallies,
-            "steps_free": float(np.mean(reach["steps"])),
-            "reached": targets / (targets + missed),
-        }
+                    hits = float(figures["via_points"].sum())
+                    reached[group.layout] = hits / (hits + float(missed.sum()))
+        return {"tallies": tallies, "steps_free": steps_free, "reached": reached}
 
 
 def score(ours: dict[str, Any], vices: dict[str, Any]) -> tuple[float, float]:
@@ -205,7 +224,8 @@ def score(ours: dict[str, Any], vices: dict[str, Any]) -> tuple[float, float]:
         if not name.endswith("adversarial"):  # it presses against obstacles
             lost.append(max(0.0, 1.0 - mine.progress / base.progress))
     slower = max(0.0, ours["steps_free"] / vices["steps_free"] - 1.0)
-    return float(np.mean(left)), float(np.mean(lost) + slower + 1.0 - ours["reached"])
+    missed = sum(1.0 - share for share in ours["reached"].values())
+    return float(np.mean(left)), float(np.mean(lost) + slower + missed)
 
 
 def report_rows(name: str, ours: dict[str, Any], vices: dict[str, Any]) -> list[Row]:
@@ -227,8 +247,9 @@ def report_rows(name: str, ours: dict[str, Any], vices: dict[str, Any]) -> list[
         rows.append(Row(f"{name}/{scene}/torque_jump", tally.jump, "N m", note))
     ratio = ours["steps_free"] / vices["steps_free"]
     rows.append(Row(f"{name}/steps_free", ratio, "of VICES", "steps per target"))
-    note = f"VICES {vices['reached']:.3f}"
-    rows.append(Row(f"{name}/reached", ours["reached"], "", note))
+    for layout, share in ours["reached"].items():
+        note = f"VICES {vices['reached'][layout]:.3f}"
+        rows.append(Row(f"{name}/{layout}/reached", share, "", note))
     return rows
 
 
@@ -265,6 +286,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write rows and trials to this file")
     parser.add_argument("--plot", type=Path, help="the trade-off, as a PNG")
     parser.add_argument("--trials", type=int, default=60)
+    parser.add_argument("--minutes", type=float, help="no trial begins after these")
     parser.add_argument("--worlds", type=int, default=32, help="of each policy")
     parser.add_argument("--steps", type=int, default=320, help="policy steps of each")
     parser.add_argument("--report", type=int, default=4, help="held-out seeds")
@@ -297,7 +319,9 @@ def main(argv: list[str] | None = None) -> None:
     sampler = optuna.samplers.TPESampler(seed=0, multivariate=True)
     study = optuna.create_study(directions=("minimize", "minimize"), sampler=sampler)
     study.enqueue_trial(dataclasses.asdict(Parameters()))
-    study.optimize(objective, n_trials=args.trials)
+    study.optimize(
+        objective, args.trials, timeout=60.0 * args.minutes if args.minutes else None
+    )
 
     candidates = {"default": Parameters()}
     names = {field.name for field in dataclasses.fields(Parameters)}
@@ -306,8 +330,11 @@ def main(argv: list[str] | None = None) -> None:
         values = {name: trial[name] for name in names}
         candidates[f"trial_{i}"] = Parameters(**values)
     rows: list[Row] = []
+    seeds = range(REPORT_SEED, REPORT_SEED + args.report)
+    base = pooled([benches["vices"].run(None, seed) for seed in seeds])
     for name, parameters in candidates.items():
-        rows += held_out(name, parameters, benches, args.report)
+        runs = [benches["rmp_vices"].run(parameters, seed) for seed in seeds]
+        rows += report_rows(name, pooled(runs), base)
     show(rows, "Held-out seeds")
     if args.plot:
         plot(trials, args.plot)
@@ -322,25 +349,20 @@ def main(argv: list[str] | None = None) -> None:
         args.json.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def held_out(
-    name: str, parameters: Parameters, benches: dict[str, Bench], seeds: int
-) -> list[Row]:
-    """Rows of one candidate over the seeds of the report."""
-    total: list[dict[str, Any]] = []
-    for kind, given in (("rmp_vices", parameters), ("vices", None)):
-        runs = [benches[kind].run(given, REPORT_SEED + i) for i in range(seeds)]
-        tallies = {
+def pooled(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """The runs of several seeds as one."""
+    first = runs[0]
+    return {
+        "tallies": {
             scene: _sum([run["tallies"][scene] for run in runs])
-            for scene in runs[0]["tallies"]
-        }
-        total.append(
-            {
-                "tallies": tallies,
-                "steps_free": float(np.mean([run["steps_free"] for run in runs])),
-                "reached": float(np.mean([run["reached"] for run in runs])),
-            }
-        )
-    return report_rows(name, *total)
+            for scene in first["tallies"]
+        },
+        "steps_free": float(np.mean([run["steps_free"] for run in runs])),
+        "reached": {
+            layout: float(np.mean([run["reached"][layout] for run in runs]))
+            for layout in first["reached"]
+        },
+    }
 
 
 def _sum(tallies: list[Tally]) -> Tally:

@@ -51,5 +51,6 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
         joint_limit=RMPflowJointLimit(robot.q_lower, robot.q_upper),
         posture=None,
         yielding=None,
+        limit_yielding=None,
         regularizer=REGULARIZER,
     )

@@ -16,7 +16,7 @@ from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.avoidance import KINDS, obstacle_branch, self_branch
 from rmp_mjx.control.torque import scale_torque
 from rmp_mjx.control.tree import rmp_vices_tree
-from rmp_mjx.control.yielding import Yielding
+from rmp_mjx.control.yielding import Yielding, limit_yielding
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
@@ -73,6 +73,9 @@ class RMPVICES:
     yielding: Yielding | Any | None = ...
     """Weight of the orientation attractor beside spheres, capsules and boxes; a plane
     cannot be gone round."""
+    limit_yielding: Yielding | Any | None = ...
+    """Weight of the orientation attractor near a joint's limit: a hand that can turn no
+    further still moves on. The lesser of the two weights counts."""
     regularizer: Float[Array, ""] | float = 1e-3
     """The root's epsilon: damps accelerations that nothing asks for."""
     action_range: ActionRange = struct.field(default_factory=ActionRange)
@@ -93,6 +96,7 @@ class RMPVICES:
             "joint_limit": lambda: JointLimitBarrier(robot.q_lower, robot.q_upper),
             "posture": lambda: Posture(q_0=robot.q_home, kq=2.5, kd=10.0),
             "yielding": Yielding,
+            "limit_yielding": limit_yielding,
         }
         for name, make in defaults.items():
             if getattr(self, name) is ...:
@@ -131,11 +135,12 @@ class RMPVICES:
         Returns:
             Torque, acceleration, root RMP and diagnostics: `torque_scale` in [0, 1],
             `clearance` [m], the least distance of a control point to an obstacle, and
-            `orientation_weight` in [0, 1], what `yielding` leaves of the orientation.
+            `orientation_weight` in [0, 1], what yielding leaves of the orientation.
         """
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
-        branches, clearance, yielded = self._avoidance(arm, obstacles)
+        branches, clearance, beside = self._avoidance(arm, obstacles)
+        yielded = self._yield(q, beside)
         if self.jacobian == "autodiff":
             tree = rmp_vices_tree(self, setpoint, obstacles, Mq, yielded)
             root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
@@ -179,7 +184,7 @@ class RMPVICES:
     def _avoidance(
         self, arm: ArmState, obstacles: Obstacles
     ) -> tuple[list[RMP], Float[Array, ""], Float[Array, ""]]:
-        """The collision branches on the joints, the clearance, the yielded weight."""
+        """The collision branches on the joints, the clearance, that to bodies."""
         branches, nearest = [], {}
         if self.collision is not None:
             rmp, nearest = obstacle_branch(self.robot, arm, obstacles, self.collision)
@@ -187,9 +192,21 @@ class RMPVICES:
         if self.self_collision is not None:
             branches.append(self_branch(self.robot, arm, self.self_collision))
         infinite = jnp.array(jnp.inf, arm.p.dtype)
-        clearance = functools.reduce(jnp.minimum, nearest.values(), infinite)
         bodies = [d for kind, d in nearest.items() if kind != "planes"]
-        if self.yielding is None or not bodies:
-            return branches, clearance, jnp.ones_like(infinite)
-        yielded = self.yielding(functools.reduce(jnp.minimum, bodies))
-        return branches, clearance, yielded
+        clearance, beside = (
+            functools.reduce(jnp.minimum, distances, infinite)
+            for distances in (nearest.values(), bodies)
+        )
+        return branches, clearance, beside
+
+    def _yield(
+        self, q: Float[Array, " n"], beside: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """Weight of the orientation, from the joints and the clearance to bodies."""
+        weight = jnp.ones_like(beside)
+        if self.yielding is not None:
+            weight = jnp.minimum(weight, self.yielding(beside))
+        if self.limit_yielding is not None:
+            room = jnp.minimum(q - self.robot.q_lower, self.robot.q_upper - q)
+            weight = jnp.minimum(weight, self.limit_yielding(jnp.min(room)))
+        return weight

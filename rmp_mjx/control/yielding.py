@@ -1,4 +1,4 @@
-"""How the orientation yields to obstacles, so that the hand can turn past them."""
+"""How the orientation yields, so that the hand can turn past what stops it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 @struct.dataclass
 class Yielding:
-    r"""Weight of the orientation attractor beside an obstacle of clearance c.
+    r"""Weight of the orientation attractor where an obstacle or a limit leaves room c.
 
     .. math:: h = h_{least}^{\,s}, \quad
         s = \mathrm{clip}\Bigl(\frac{c_{far} - c}{c_{far} - c_{near}}, 0, 1\Bigr)
@@ -23,14 +23,19 @@ class Yielding:
     """
 
     least: Float[Array, ""] | float = 0.01
-    """Weight at the obstacle, [m^2/rad^2], > 0; 1 holds the orientation everywhere."""
+    """Weight where there is no room, [m^2/rad^2], > 0; 1: the orientation holds."""
     near: Float[Array, ""] | float = 0.02
-    """Clearance up to which the weight is ``least``, [m]."""
+    """Room up to which the weight is ``least``, [m] or [rad]."""
     far: Float[Array, ""] | float = 0.08
-    """Clearance from which on the weight is 1, [m]."""
+    """Room from which on the weight is 1, [m] or [rad]."""
 
-    def __call__(self, clearance: Float[Array, ""]) -> Float[Array, ""]:
-        """The weight at a clearance [m]; 1 if that is infinite."""
-        inside = self.far - jnp.minimum(clearance, self.far)  # finite gradients at inf
+    def __call__(self, room: Float[Array, ""]) -> Float[Array, ""]:
+        """The weight at a distance [m] or [rad]; 1 if that is infinite."""
+        inside = self.far - jnp.minimum(room, self.far)  # finite gradients at inf
         share = jnp.minimum(inside / (self.far - self.near), 1.0)
-        return jnp.asarray(self.least, clearance.dtype) ** share
+        return jnp.asarray(self.least, room.dtype) ** share
+
+
+def limit_yielding() -> Yielding:
+    """Yielding near a joint's limit; room in rad."""
+    return Yielding(least=0.01, near=0.2, far=1.2)

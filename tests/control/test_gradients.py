@@ -30,7 +30,8 @@ def gradient():
 
 def _parts(ctrl):
     """Everything tunable of the controller."""
-    names = ("collision", "self_collision", "joint_limit", "posture", "yielding")
+    names = ("collision", "self_collision", "joint_limit", "posture")
+    names += ("yielding", "limit_yielding")
     parts = {name: getattr(ctrl, name) for name in names}
     parts |= {"attractor_weight": 1.0, "regularizer": 1e-3}
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), parts)

@@ -156,6 +156,7 @@ def test_every_branch_matters(run64, ctrl, inputs, fast):
         ("self_collision", {"mu": 1.0}),
         ("posture", {"kq": 1.0}),
         ("yielding", {"least": 0.5}),
+        ("limit_yielding", {"least": 0.5}),
     ):
         leaf = dataclasses.replace(getattr(ctrl, field), **change)
         out = run64(ctrl.replace(**{field: leaf}), *inputs)

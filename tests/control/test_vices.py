@@ -72,7 +72,8 @@ def test_tree_without_safety_converges_to_coupled_operational_space_control(
     """
     args, terms, wanted = case
     strong = robot.replace(tau_max=np.full(7, 1e12))
-    off = dict.fromkeys(("collision", "self_collision", "joint_limit", "posture"))
+    safety = ("collision", "self_collision", "joint_limit", "posture")
+    off = dict.fromkeys((*safety, "yielding", "limit_yielding"))
     expected, quality = [], []
     for k in range(len(args[0])):
         J, Mq = terms.J[k], terms.Mq[k]

@@ -24,8 +24,9 @@ def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obs
     low = near.planes.replace(point=near.planes.point - 5.0 * UP)
     high = near.planes.replace(point=near.planes.point + 0.4 * UP)
     weights = []
+    holding = ctrl.replace(limit_yielding=None)
     for planes in (low, high):
-        out = run64(ctrl, q, qd, action, near.replace(planes=planes))
+        out = run64(holding, q, qd, action, near.replace(planes=planes))
         weights.append(out.diagnostics["orientation_weight"])
         clearance = out.diagnostics["clearance"]
         if planes is low:  # then the nearest obstacle is a body
@@ -34,3 +35,17 @@ def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obs
     np.testing.assert_array_equal(*weights)
     assert np.mean(weights[0] == 1.0) > 0.05
     assert np.mean(weights[0] < 0.5) > 0.05
+
+
+def test_orientation_yields_to_the_nearest_joint_limit(run64, ctrl, states, obstacles):
+    """1e-9: float64. Joints without a limit do not count."""
+    q, qd, action = states(4)
+    out = run64(ctrl.replace(yielding=None), q, qd, action, obstacles(4))
+    weight = out.diagnostics["orientation_weight"]
+    lower, upper = np.asarray(ctrl.robot.q_lower), np.asarray(ctrl.robot.q_upper)
+    assert np.isinf(lower).any()
+    room = np.minimum(q - lower, upper - q).min(1)
+    share = np.clip((1.2 - room) / 1.0, 0.0, 1.0)
+    np.testing.assert_allclose(weight, 0.01**share, rtol=1e-9)
+    assert np.mean(weight == 1.0) > 0.05
+    assert np.mean(weight < 0.5) > 0.05
