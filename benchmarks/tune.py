@@ -61,33 +61,33 @@ SCENES = (
 class Parameters:
     """What is tuned; the defaults are the leaves' own (a test holds them together)."""
 
-    mu: float = 5e-5
+    mu: float = 1e-4
     """Collision: metric scale."""
-    eps: float = 0.05
+    eps: float = 0.3
     """Collision: velocity floor."""
-    eta: float = 20.0
+    eta: float = 30.0
     """Collision: damping [1/s]."""
     r: float = 0.2
     """Collision: range [m]."""
-    margin: float = 0.005
+    margin: float = 0.007
     """Collision: margin [m]."""
-    limit_mu: float = 1e-2
+    limit_mu: float = 3.5e-3
     """Joint limits: metric scale."""
-    limit_margin: float = 0.12
+    limit_margin: float = 0.14
     """Joint limits: margin [rad]."""
-    limit_r: float = 0.5
+    limit_r: float = 0.25
     """Joint limits: range [rad]."""
-    kq: float = 2.5
+    kq: float = 1.2
     """Posture: stiffness [1/s^2]."""
-    posture: float = 0.02
+    posture: float = 5e-3
     """Posture: weight."""
-    least: float = 0.01
+    least: float = 2e-3
     """Yielding: weight of the orientation at an obstacle."""
-    far: float = 0.08
+    far: float = 0.06
     """Yielding: clearance at which it begins [m]."""
-    limit_least: float = 0.01
+    limit_least: float = 2.5e-3
     """Yielding near joint limits: weight of the orientation at a limit."""
-    limit_far: float = 1.2
+    limit_far: float = 1.9
     """Yielding near joint limits: distance at which it begins [rad]."""
 
     @staticmethod

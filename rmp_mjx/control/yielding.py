@@ -16,17 +16,17 @@ class Yielding:
 
     The identity metrics of the two attractors weigh 1 rad/s^2 like 1 m/s^2, so a hand
     that meets an obstacle would rather stop than turn by a degree. With ``least`` the
-    square of a hand's length a turn counts as far as it moves the hand's other end, and
+    square of a length, a turn counts as far as it moves what is at that distance, and
     the reaction of the collision leaves turns the hand out of the way.
 
     A state-dependent edge weight of the tree, as in RMPfusion (Li et al., 2019).
     """
 
-    least: Float[Array, ""] | float = 0.01
+    least: Float[Array, ""] | float = 2e-3
     """Weight where there is no room, [m^2/rad^2], > 0; 1: the orientation holds."""
     near: Float[Array, ""] | float = 0.02
     """Room up to which the weight is ``least``, [m] or [rad]."""
-    far: Float[Array, ""] | float = 0.08
+    far: Float[Array, ""] | float = 0.06
     """Room from which on the weight is 1, [m] or [rad]."""
 
     def __call__(self, room: Float[Array, ""]) -> Float[Array, ""]:
@@ -38,4 +38,4 @@ class Yielding:
 
 def limit_yielding() -> Yielding:
     """Yielding near a joint's limit; room in rad."""
-    return Yielding(least=0.01, near=0.2, far=1.2)
+    return Yielding(least=2.5e-3, near=0.2, far=1.9)
