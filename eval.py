@@ -10,7 +10,7 @@ from rich.console import Console
 
 import envs
 from rmp_mjx import runtime, sim
-from rmp_mjx.training import cli, evaluate, film, networks, report
+from rmp_mjx.training import cli, evaluate, film, networks, report, run_folder
 from rmp_mjx.training.checkpoint import CheckpointError
 from rmp_mjx.training.config import validate
 from rmp_mjx.training.train import load_agent
@@ -42,10 +42,15 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         configs, out = options.resolve()
         config = validate(configs[0], envs.names())
+        for asked in configs:
+            sim.require(asked.physics)
         settings = [envs.parse_options(c.env, c.env_options) for c in configs]
+        newer = run_folder.changed_software(Path(options.run)) if options.run else []
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    if newer:
+        console.print(f"trained with other software: {', '.join(newer)}")
     runtime.configure()
     tasks = [
         envs.load(c.env, controller=c.controller, physics=c.physics, **setting)
@@ -55,7 +60,13 @@ def main(args: Sequence[str] | None = None) -> int:
     if options.run:
         try:
             iterations, agent = load_agent(
-                env, config, Path(options.run), options.deterministic, console.print
+                env,
+                config,
+                Path(options.run),
+                options.deterministic,
+                console.print,
+                options.seed_index,
+                options.checkpoint,
             )
         except CheckpointError as error:
             print(f"error: {error}", file=sys.stderr)

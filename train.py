@@ -5,48 +5,85 @@ from collections.abc import Sequence
 from functools import partial
 
 import jax
+import polars as pl
 from rich.console import Console
 
 import envs
 from eval import engine
-from rmp_mjx import runtime
-from rmp_mjx.training import cli, evaluate, figures, film, report, run_folder
+from rmp_mjx import runtime, sim
+from rmp_mjx.training import (
+    cli,
+    distributed,
+    evaluate,
+    figures,
+    film,
+    grid,
+    metrics,
+    report,
+    run_folder,
+    seeds,
+)
 from rmp_mjx.training.checkpoint import CheckpointError
-from rmp_mjx.training.config import TrainConfig, validate
+from rmp_mjx.training.config import ConfigError, TrainConfig, validate
 from rmp_mjx.training.train import TrainingFailure, train
 
 
 def finish(env, agent, config: TrainConfig, folder, console: Console) -> None:
-    """Evaluate, plot and film a trained policy."""
-    title = f"{config.env}, {config.controller}, seed {config.seed}"
-    figures.plot_learning_curve(
-        folder / run_folder.METRICS, folder / run_folder.CURVE, title
-    )
+    """Evaluate, plot and film the policy of every seed; the primary process writes."""
+    primary = distributed.is_primary()
+    title = f"{config.env}, {config.controller}, {seeds.title(config)}"
+    if primary:
+        plot(config, folder, title)
     if config.eval_episodes:
-        key = jax.random.key(config.seed + 1000)
-        filmed = film.EPISODES if config.video else 0
-        results, tape = evaluate.record_episodes(
-            env, agent, config.eval_episodes, key, filmed
-        )
-        about = {"agent": "policy", "deterministic": config.eval_deterministic}
-        columns = report.save(
-            {engine(env): results}, env.metric_reductions, about, folder, title
-        )
-        console.print(report.table(columns, title, env.task_metrics))
-        if config.video:
-            from envs.render import render  # loads graphics libraries
-
-            film.publish(partial(render, env), tape, env.dt, folder, console)
+        evaluate_seeds(env, agent, config, folder, title, console, primary)
     console.print(f"results: {folder}", markup=False, highlight=False)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Parse, check, train, evaluate; returns the exit code."""
-    console = Console()
+def plot(config: TrainConfig, folder, title: str) -> None:
+    """The learning curve, with several seeds that of all together too."""
+    path, over_seeds = folder / run_folder.METRICS, None
+    if config.num_seeds > 1:
+        rows = pl.read_parquet(path)
+        over_seeds = metrics.over_seeds(rows, figures.curves(rows))
+        (folder / run_folder.SEEDS).mkdir(exist_ok=True)
+        over_seeds.write_parquet(folder / run_folder.SEED_CURVES)
+    figures.plot_learning_curve(path, folder / run_folder.CURVE, title, over_seeds)
+
+
+def evaluate_seeds(
+    env, agent, config: TrainConfig, folder, title: str, console: Console, primary: bool
+) -> None:
+    """Run the evaluation's episodes with every seed's policy; report them."""
+    key = jax.random.key(config.seed + 1000)
+    filmed = film.EPISODES if config.video else 0
+    record = evaluate.recorder(env, config.eval_episodes, filmed)
+    about = {"agent": "policy", "deterministic": config.eval_deterministic}
+    columns, tapes = [], []
+    for k, place in enumerate(seeds.folders(config, folder)):
+        results, tape = record(seeds.of_seed(agent, k, config), key)
+        tapes.append(tape)
+        if primary:
+            found = {engine(env): results}
+            columns.append(
+                report.save(found, env.metric_reductions, about, place, title)
+            )
+    if not primary:
+        return
+    shown = columns[0]
+    if config.num_seeds > 1:
+        shown = report.save_over_seeds(columns, about, folder)
+    console.print(report.table(shown, title, env.task_metrics))
+    if config.video:
+        from envs.render import render  # loads graphics libraries
+
+        film.publish(partial(render, env), tapes[0], env.dt, folder, console)
+
+
+def run(config: TrainConfig, console: Console) -> int:
+    """Train and evaluate one configuration; returns the exit code."""
     try:
-        config = validate(cli.parse_train(args), envs.names())
         options = envs.parse_options(config.env, config.env_options)
-        folder, lock = run_folder.open_run(config)
+        folder, lock = distributed.open_run(config)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -60,12 +97,37 @@ def main(args: Sequence[str] | None = None) -> int:
         )
         try:
             result = train(env, config, folder, console)
-        except (CheckpointError, TrainingFailure) as error:
+        except (CheckpointError, TrainingFailure, ConfigError) as error:
             print(f"error: {error}", file=sys.stderr)
-            return 1
-        if not result.exit_code and not result.had_finished:
+            return 2 if isinstance(error, ConfigError) else 1
+        last = run_folder.EVALUATION if config.eval_episodes else run_folder.CURVE
+        reported = result.had_finished and (folder / last).exists()
+        if not result.exit_code and not reported:
             finish(env, result.agent, config, folder, console)
         return result.exit_code
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Parse, check, train, evaluate; returns the exit code."""
+    console = Console()
+    try:
+        options = cli.parse_train(args)
+        wanted = options.grid
+        configs = list(wanted.cells().values()) if wanted else [options.config]
+        for config in configs:
+            validate(config, envs.names())
+            sim.require(config.physics)
+            envs.parse_options(config.env, config.env_options)
+        distributed.join(options.coordinator, options.process_id, options.num_processes)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    if not distributed.alone():
+        runtime.configure()
+        console = Console(quiet=not distributed.is_primary())
+    if wanted:
+        return grid.run(wanted, partial(run, console=console), console)
+    return run(configs[0], console)
 
 
 if __name__ == "__main__":

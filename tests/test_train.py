@@ -1,10 +1,12 @@
 """`train.py` from its command line to its results, on a toy task."""
 
+import dataclasses
 import json
 import subprocess
 import sys
 import types
 
+import polars as pl
 import pytest
 
 import train
@@ -59,12 +61,76 @@ def test_a_run_trains_evaluates_and_plots(toy, tmp_path):
     assert toy[-1]["variant"] == "heavy"
 
 
+def test_several_seeds_leave_a_result_each_and_one_of_all(toy, tmp_path):
+    folder = tmp_path / "run"
+    options = [*OPTIONS, "--run_dir", str(folder), "--seed", "5", "--num_seeds", "2"]
+    assert train.main(options) == 0
+    found = json.loads((folder / "eval.json").read_text())
+    own = [
+        json.loads((folder / "seeds" / name / "eval.json").read_text())
+        for name in ("5", "6")
+    ]
+    assert (found["seeds"], found["episodes"]) == (2, 2 * SMALL["eval_episodes"])
+    returns = [one["return_mean"] for one in own]
+    assert found["return_mean"] == pytest.approx(sum(returns) / 2)
+    curves = pl.read_parquet(folder / "seeds" / "curves.parquet")
+    assert curves["steps"].to_list() == [64, 128, 192, 256]
+    assert "episode/return_low" in curves.columns
+    assert (folder / "learning_curve.png").stat().st_size > 0
+
+    assert train.main(["--resume", str(folder)]) == 0  # nothing left to do
+    (folder / "eval.json").unlink()  # as if it was killed before the evaluation
+    assert train.main(["--resume", str(folder)]) == 0
+    assert json.loads((folder / "eval.json").read_text()) == found
+
+
+def test_a_grid_trains_every_cell_and_goes_on_where_it_stopped(
+    toy, tmp_path, monkeypatch, capsys
+):
+    folder = tmp_path / "grid"
+    steps = ["--num_timesteps", "128", "--eval_episodes", "0"]
+    options = [*OPTIONS, *steps, "--run_dir", str(folder)]
+    options += ["--envs", "counter", "--controllers", "vices,rmp_vices"]
+    trained = []
+
+    whole = train.train
+
+    def stopped(env, config, *rest):
+        """The second cell is stopped by a signal after its first iteration."""
+        trained.append(config.controller)
+        if len(trained) == 1:
+            return whole(env, config, *rest)
+        half = dataclasses.replace(config, num_timesteps=64)
+        return dataclasses.replace(whole(env, half, *rest), exit_code=143)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "train", stopped)
+        assert train.main(options) == 143
+    assert trained == ["vices", "rmp_vices"]
+    said = "".join(capsys.readouterr().out.split())  # the terminal breaks lines
+    assert f"--resume{folder}" in said
+    assert train.main(options) == 2  # not empty
+    assert train.main(["--resume", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "cell 1/2: counter-vices has finished" in said
+    cells = json.loads((folder / "grid.json").read_text())["finished"]
+    assert list(cells) == ["counter-vices", "counter-rmp_vices"]
+    for name in cells:
+        config = json.loads((folder / name / "config.json").read_text())
+        assert name == f"counter-{config['controller']}"
+        assert (folder / name / "learning_curve.png").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--env", "nowhere"], "known: "),
         (["--num-envs", "3", "--unroll_length", "5"], "does not divide"),
         (["--resume", "/nonexistent"], "no run folder"),
+        (["--envs", "trajectory,nowhere"], "unknown env 'nowhere'"),
+        (["--controllers", "vices,pid"], "unknown controller 'pid'"),
+        (["--num_processes", "2"], "need --coordinator"),
+        (["--num_seeds", "0"], "num_seeds must be at least 1"),
         (["--no_such_option"], "no_such_option"),
         (["--env_options", "obstacle=2"], "Did you mean 'obstacles'"),
         (["--env_options", "layout=near"], "far, close"),

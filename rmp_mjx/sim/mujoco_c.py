@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import threading
+import functools
+import os
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +18,15 @@ from rmp_mjx.sim.base import PhysicsState, init_state
 class MujocoPhysics:
     """A batch of C simulations, one thread per core, behind a host callback.
 
-    Each step loads the environments' states into the batch and reads the results
-    back: the engine itself remembers nothing, so the step is a pure function.
+    Each step loads the environments' states into a batch and reads the results
+    back: the engine itself remembers nothing, so the step is a pure function. Steps
+    that run at once, those of several devices or of two programs, take a batch each.
     """
 
     def __init__(self, model: mujoco.MjModel):
-        """Keep the model; batches are made when their size is first seen."""
+        """Keep the model; batches are made when they are first needed."""
         self.model = model
-        self._batches: dict[int, mujoco.batch.Batch] = {}
-        self._lock = threading.Lock()  # JAX may run two programs at once
+        self._idle: dict[tuple[int, int], list[mujoco.batch.Batch]] = {}
 
     def init(
         self, qpos: Array, qvel: Array, mocap_pos: Array | None = None
@@ -44,7 +45,7 @@ class MujocoPhysics:
             lambda x: jax.ShapeDtypeStruct(jnp.shape(x), x.dtype), moving
         )
         qpos, qvel, warmstart, sensors = jax.pure_callback(
-            self._step_host,
+            functools.partial(self._step_host, _threads()),
             shapes,
             state.qpos,
             state.qvel,
@@ -57,16 +58,20 @@ class MujocoPhysics:
             qpos=qpos, qvel=qvel, warmstart=warmstart, sensors=sensors
         )
 
-    def _step_host(self, qpos, qvel, warmstart, mocap_pos, ctrl):
-        qpos, qvel, warmstart, mocap_pos, ctrl = map(
-            np.asarray, (qpos, qvel, warmstart, mocap_pos, ctrl)
-        )
-        with self._lock:
-            return self._step_batch(qpos, qvel, warmstart, mocap_pos, ctrl)
+    def _step_host(self, threads, qpos, *others):
+        size = int(np.prod(qpos.shape[:-1], dtype=int))
+        idle = self._idle.setdefault((size, threads), [])
+        try:
+            batch = idle.pop()  # one step of a list: no two callers get the same
+        except IndexError:
+            batch = mujoco.batch.Batch(self.model, size, threads)
+            batch.bind("sensordata")
+        out = self._step_batch(batch, *map(np.asarray, (qpos, *others)))
+        idle.append(batch)
+        return out
 
-    def _step_batch(self, qpos, qvel, warmstart, mocap_pos, ctrl):
+    def _step_batch(self, batch, qpos, qvel, warmstart, mocap_pos, ctrl):
         lead, dtype = qpos.shape[:-1], qpos.dtype
-        batch = self._batch(int(np.prod(lead, dtype=int)))
         good = np.ones(batch.nsim, bool)
         for x in (qpos, qvel, ctrl, mocap_pos):
             flat = x.reshape(batch.nsim, x.size // batch.nsim)
@@ -88,9 +93,10 @@ class MujocoPhysics:
             for x in out
         )
 
-    def _batch(self, size: int) -> mujoco.batch.Batch:
-        if size not in self._batches:
-            batch = mujoco.batch.Batch(self.model, size)
-            batch.bind("sensordata")
-            self._batches[size] = batch
-        return self._batches[size]
+
+def _threads() -> int:
+    """Threads of a batch: the cores, shared by the devices that step at once."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+    mesh = jax.sharding.get_abstract_mesh()  # that of an enclosing shard_map
+    here = 1 if mesh.empty else max(1, mesh.size // jax.process_count())
+    return max(1, (cores or os.cpu_count() or 1) // here)

@@ -6,10 +6,11 @@ itself neither detects a flipped bit nor refuses another dtype. Zero-size arrays
 which Orbax cannot store, come from the template; PRNG keys are stored as their data.
 """
 
+import contextlib
 import hashlib
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as retention
+
+NEWEST, BEST = "newest", "best"
+"""Checkpoints that can be asked for without a number."""
+MERITS = ("success", "return")
+"""Means over recent episodes that rank checkpoints, the first first."""
 
 
 class CheckpointError(RuntimeError):
@@ -25,6 +32,10 @@ class CheckpointError(RuntimeError):
 
 class CheckpointMismatch(CheckpointError):
     """The checkpoint belongs to another configuration or task."""
+
+
+class SaveError(CheckpointError):
+    """A checkpoint could not be written; those before it are untouched."""
 
 
 def _is_key(leaf: Any) -> bool:
@@ -53,20 +64,32 @@ def _digest(arrays: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(arrays, sort_keys=True).encode()).hexdigest()
 
 
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Leaves of a tree by their paths in it."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+
+
+def _rank(merit: Mapping[str, float]) -> tuple[float, ...]:
+    return tuple(merit[name] for name in MERITS)
 
 
 class Checkpointer:
     """The checkpoints of one run folder."""
 
-    def __init__(self, folder: Path, keep: int = 3, read_only: bool = False):
+    def __init__(
+        self,
+        folder: Path,
+        keep: int = 3,
+        keep_every: int = 0,
+        read_only: bool = False,
+    ):
         """Open a folder of checkpoints.
 
         Args:
             folder: The folder; created unless `read_only`.
-            keep: Newest checkpoints that are kept.
+            keep: Newest checkpoints that are kept; so is the best one.
+            keep_every: Checkpoints at multiples of this are kept too; 0: none.
             read_only: Do not create or clean up anything.
         """
         for name in ("absl", "orbax"):  # they narrate every save at INFO and WARNING
@@ -75,49 +98,86 @@ class Checkpointer:
         self._read_only = read_only
         if read_only and not self._folder.is_dir():
             raise CheckpointError(f"no checkpoints in {folder}")
-        self._manager = ocp.CheckpointManager(
-            self._folder,
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=None if read_only else keep,
-                enable_async_checkpointing=False,
-                cleanup_tmp_directories=not read_only,
-                create=not read_only,
-                read_only=read_only,
+        if not read_only:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        kept = [
+            retention.LatestN(keep),
+            retention.BestN(
+                get_metric_fn=_rank,  # pyright: ignore[reportArgumentType]
+                n=1,
+                keep_checkpoints_without_metrics=False,
+            ),
+        ]
+        if keep_every:
+            kept.append(retention.EveryNSteps(keep_every))
+        self._options = ocp.CheckpointManagerOptions(
+            preservation_policy=retention.AnyPreservationPolicy(kept),
+            best_fn=_rank,  # pyright: ignore[reportArgumentType]
+            enable_async_checkpointing=False,
+            cleanup_tmp_directories=not read_only,
+            create=False,
+            read_only=read_only,
+            # each process by itself: Orbax would wait for the others otherwise
+            multiprocessing_options=ocp.options.MultiprocessingOptions(
+                primary_host=jax.process_index(),
+                active_processes={jax.process_index()},
             ),
         )
+        self._manager = self._open()
 
-    def save(self, step: int, state: Any) -> None:
+    def _open(self) -> ocp.CheckpointManager:
+        return ocp.CheckpointManager(self._folder, options=self._options)
+
+    def save(
+        self, step: int, state: Any, merit: Mapping[str, float] | None = None
+    ) -> None:
         """Write a checkpoint; when this returns it is complete.
 
         Args:
             step: Its number, larger than all before.
             state: Any pytree of arrays.
+            merit: How good it is, by `MERITS`; None: not known.
+
+        Raises:
+            SaveError: It could not be written, for instance because the disk is full.
+                What was written of it is removed; earlier ones are untouched.
         """
         arrays, manifest = {}, {}
-        for index, (path, leaf) in enumerate(_named_leaves(state).items()):
+        for index, (path, leaf) in enumerate(named_leaves(state).items()):
             array = _storable(leaf)
             if array.size:
                 name = f"{index:05d}"
                 arrays[name] = array
                 manifest[name] = _describe(path, array)
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                state=ocp.args.StandardSave(arrays),  # pyright: ignore
-                manifest=ocp.args.JsonSave(  # pyright: ignore
-                    {"arrays": manifest, "sha256": _digest(manifest)}
+        try:
+            self._manager.save(
+                step,
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardSave(arrays),  # pyright: ignore
+                    manifest=ocp.args.JsonSave(  # pyright: ignore
+                        {"arrays": manifest, "sha256": _digest(manifest)}
+                    ),
                 ),
-            ),
-        )
-        self._manager.wait_until_finished()
+                metrics=dict(merit) if merit else None,
+            )
+            self._manager.wait_until_finished()
+        except Exception as error:  # Orbax's errors share no base class
+            with contextlib.suppress(Exception):
+                self._manager.close()
+            self._manager = self._open()  # removes what is half written
+            raise SaveError(f"checkpoint {step}: {_reason(error)}") from error
 
-    def restore(self, template: Any, note: Callable[[str], None]) -> tuple[int, Any]:
-        """Read the newest sound checkpoint.
+    def restore(
+        self, template: Any, note: Callable[[str], None], which: str = NEWEST
+    ) -> tuple[int, Any]:
+        """Read the newest sound checkpoint, or another one.
 
         Args:
             template: Pytree of arrays or shapes that the result will look like; parts
                 that are None are not read.
             note: Called with one line for each checkpoint that had to be skipped.
+            which: `newest`, `best`, or a number. Only the newest has a stand-in, the
+                one before it, where it is damaged.
 
         Returns:
             Step number and the state.
@@ -126,14 +186,26 @@ class Checkpointer:
             CheckpointMismatch: Arrays are missing or have other shapes or dtypes.
             CheckpointError: There is no sound checkpoint.
         """
-        steps = sorted(self._manager.all_steps(read=True), reverse=True)
+        steps = self.steps
+        if which != NEWEST:
+            step = self._choose(which, steps)
+            try:
+                return step, _fill(template, self._read(step))
+            except CheckpointMismatch:
+                raise
+            except Exception as error:
+                raise CheckpointError(
+                    f"checkpoint {step} is damaged: {_reason(error)}"
+                ) from error
         damaged = []
         for step in steps:
             try:
                 stored = self._read(step)
             except Exception as error:  # Orbax's errors share no base class
-                reason = " ".join(str(error).split())[:200]
-                note(f"checkpoint {step} is damaged, trying an older one: {reason}")
+                note(
+                    f"checkpoint {step} is damaged, trying an older one: "
+                    f"{_reason(error)}"
+                )
                 damaged.append(step)
             else:
                 state = _fill(template, stored)
@@ -141,6 +213,25 @@ class Checkpointer:
                     self._manager.delete(old)  # its number will be needed again
                 return step, state
         raise CheckpointError(f"no usable checkpoint in {self._folder}")
+
+    @property
+    def steps(self) -> list[int]:
+        """Numbers of the checkpoints, sound or not, the newest first."""
+        return sorted(self._manager.all_steps(read=True), reverse=True)
+
+    def _choose(self, which: str, steps: list[int]) -> int:
+        """The step of the best checkpoint, or of the one with this number."""
+        if which == BEST:
+            merits = ((self._manager.metrics(step), step) for step in steps)
+            ranked = [(_rank(merit), step) for merit, step in merits if merit]
+            if ranked:
+                return max(ranked)[1]
+        elif which.isdecimal() and int(which) in steps:
+            return int(which)
+        have = ", ".join(map(str, steps[::-1])) or "none"
+        raise CheckpointError(
+            f"no checkpoint {which!r} in {self._folder}; there are: {have}"
+        )
 
     def _read(self, step: int) -> dict[str, np.ndarray]:
         """Arrays by path, every one verified."""
@@ -174,10 +265,15 @@ class Checkpointer:
         self._manager.close()
 
 
+def _reason(error: Exception) -> str:
+    """An error's message in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+
+
 def _fill(template: Any, stored: dict[str, np.ndarray]) -> Any:
     """Put stored arrays into the template's structure."""
     wrong, leaves = [], []
-    for path, leaf in _named_leaves(template).items():
+    for path, leaf in named_leaves(template).items():
         shape = _storable_shape(leaf)
         array = stored.get(path)
         if not np.prod(shape.shape):

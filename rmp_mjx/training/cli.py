@@ -3,11 +3,13 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import tyro
 
+from rmp_mjx.training.checkpoint import NEWEST
 from rmp_mjx.training.config import ConfigError, TrainConfig, load_config
+from rmp_mjx.training.grid import GRID, Grid, load_grid, open_grid
 from rmp_mjx.training.run_folder import CONFIG
 
 Options = TypeVar("Options")
@@ -23,23 +25,63 @@ def parse(kind: type[Options], args: Sequence[str] | None, default=None) -> Opti
     return tyro.cli(kind, args=args, default=default, use_underscores=True)
 
 
-def parse_train(args: Sequence[str] | None = None) -> TrainConfig:
-    """Parse the options of a training run.
+@dataclasses.dataclass(frozen=True)
+class TrainOptions(TrainConfig):
+    """Train a policy with PPO (Schulman et al., 2017), or a grid of policies."""
+
+    envs: str | None = None
+    """Tasks of a grid, joined by commas: one run for each of them and each of
+    `controllers`, one after the other."""
+    controllers: str | None = None
+    """Controllers of a grid, joined by commas."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, where several processes train together; under Slurm's
+    srun this and the next two are found out."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    num_processes: int | None = None
+    """Number of processes."""
+
+    @property
+    def config(self) -> TrainConfig:
+        """The options of a run."""
+        fields = dataclasses.fields(TrainConfig)
+        return TrainConfig(**{f.name: getattr(self, f.name) for f in fields})
+
+    @property
+    def grid(self) -> Grid | None:
+        """The grid that is asked for, if one is."""
+        if not self.envs and not self.controllers:
+            return None
+        envs = tuple((self.envs or self.env).split(","))
+        controllers = tuple((self.controllers or self.controller).split(","))
+        return open_grid(self.config, envs, controllers)
+
+
+def parse_train(args: Sequence[str] | None = None) -> TrainOptions:
+    """Parse the options of a training run or of a grid.
 
     With `--resume RUN` the defaults are those that RUN was started with.
 
     Raises:
         ConfigError: RUN is no run folder.
     """
-    config = parse(TrainConfig, args)
-    if not config.resume:
-        return config
-    saved = load_config(Path(config.resume) / CONFIG)
-    default = dataclasses.replace(saved, resume=None, run_dir=None, overwrite=False)
-    return parse(TrainConfig, args, default)
+    options = parse(TrainOptions, args)
+    if not options.resume:
+        return options
+    folder, saved = Path(options.resume), {}
+    if (folder / GRID).exists():
+        base, envs, controllers = load_grid(folder)
+        saved = {"envs": ",".join(envs), "controllers": ",".join(controllers)}
+    else:
+        base = load_config(folder / CONFIG)
+    default: dict[str, Any] = {**dataclasses.asdict(base), **saved}
+    default |= {"resume": None, "run_dir": None}
+    default |= {"overwrite": False, "allow_changes": False}
+    return parse(TrainOptions, args, TrainOptions(**default))
 
 
-REFERENCE = {"mujoco": ("sim_dt=0.002", "cone=elliptic"), "mjx": ()}
+REFERENCE = {"mujoco": ("sim_dt=0.002", "cone=elliptic"), "mjx": (), "warp": ()}
 """Second physics engines, and the task's options that go with them."""
 
 SHORTHANDS = (
@@ -79,9 +121,14 @@ class EvalConfig:
     """Whether a collision or joint-limit event ends the episode."""
     env_options: tuple[str, ...] = ()
     """Further options of the task as NAME=VALUE; they add to the run's."""
-    physics: Literal["mujoco", "mjx"] | None = None
+    physics: Literal["mujoco", "mjx", "warp"] | None = None
     """A second physics engine, where the same policy meets the same starts; mujoco: the
     C engine with 2 ms steps and elliptic friction cones."""
+    checkpoint: str = NEWEST
+    """Which checkpoint of the run: newest, best (by the success, then the return, of
+    training's episodes), or an iteration's number."""
+    seed_index: int = 0
+    """Which agent of a run that trained several seeds, from 0."""
     episodes: int = 100
     """Episodes, run in parallel."""
     deterministic: bool = False
@@ -110,6 +157,11 @@ class EvalConfig:
         if (self.run is None) == (self.agent == "policy"):
             raise ConfigError("give either --run RUN or --agent zero|random")
         base = load_config(Path(self.run) / CONFIG) if self.run else TrainConfig()
+        if not 0 <= self.seed_index < base.num_seeds:
+            raise ConfigError(
+                f"seed_index must lie in 0 .. {base.num_seeds - 1}, the agents of the "
+                f"run; is {self.seed_index}"
+            )
         asked = [(name, getattr(self, name)) for name in SHORTHANDS]
         given = tuple(f"{name}={value}" for name, value in asked if value is not None)
         config = dataclasses.replace(

@@ -3,12 +3,13 @@
 import dataclasses
 import difflib
 import json
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-CONTROLLERS = ("rmp_vices", "vices", "rmp_vices_literal")
-PHYSICS = ("auto", "mujoco", "mjx")
+CONTROLLERS = ("rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf")
+PHYSICS = ("auto", "mujoco", "mjx", "warp")
 
 
 class ConfigError(ValueError):
@@ -22,29 +23,40 @@ class TrainConfig:
     env: str = "trajectory"
     """Task to learn."""
     controller: str = "rmp_vices"
-    """Low-level controller that the policy commands: rmp_vices, vices, or
-    rmp_vices_literal (the paper's formulas with their signs corrected)."""
+    """Low-level controller that the policy commands: rmp_vices, vices,
+    rmp_vices_literal (the paper's formulas with their signs corrected), osc (vices with
+    a fixed impedance), or vices_cbf (vices behind a safety filter; extra `cbf`)."""
     physics: str = "auto"
-    """Physics engine: mujoco (C threads), mjx (JAX), or auto: mujoco on a CPU."""
+    """Physics engine: mujoco (C threads), mjx (JAX), warp (MuJoCo Warp; extra `warp`),
+    or auto: mujoco on a CPU, else mjx."""
     env_options: tuple[str, ...] = ()
     """Options of the task as NAME=VALUE, for instance obstacles=2 layout=close."""
     num_envs: int = 256
-    """Environments that run in parallel."""
+    """Environments that run in parallel, for each agent."""
     num_timesteps: int = 400_000
-    """Policy steps over all environments, rounded up to whole iterations."""
+    """Policy steps of an agent over all its environments, rounded up to whole
+    iterations."""
     seed: int = 0
     """Seed of the networks, the environments and the minibatch order."""
+    num_seeds: int = 1
+    """Agents that train in one program, apart, with seeds seed, seed + 1, ..."""
     run_dir: str | None = None
     """Folder of this run; default: runs/ENV-CONTROLLER-seedSEED-TIME."""
     resume: str | None = None
     """Run folder to continue; its saved configuration is the default then."""
     overwrite: bool = False
     """Delete the results of an earlier run found in run_dir."""
+    allow_changes: bool = False
+    """Resume although packages or our code have changed; it is no exact continuation
+    then."""
 
     unroll_length: int = 16
     """Policy steps per environment and iteration."""
     num_minibatches: int = 8
     """Minibatches per pass over an iteration's data."""
+    num_groups: int = 8
+    """Groups of environments; every minibatch takes as many steps from each. Fewer
+    groups where the sizes do not divide. The devices share whole groups."""
     num_updates_per_batch: int = 10
     """Passes over an iteration's data (epochs)."""
     discounting: float = 0.99
@@ -70,28 +82,47 @@ class TrainConfig:
     init_log_std: float = -0.5
     """Initial log standard deviation of the policy's actions."""
 
+    num_devices: int | None = None
+    """At most this many devices share the environments; default: all there are."""
     log_interval: int = 1
     """Iterations between rows of the metrics."""
     checkpoint_interval: int = 20
     """Iterations between checkpoints; the last iteration is always saved."""
     checkpoints_kept: int = 3
-    """Newest checkpoints that are kept."""
+    """Newest checkpoints that are kept, besides the best by success, then return."""
+    keep_every: int = 0
+    """Checkpoints at multiples of this many iterations are kept for good; 0: none."""
     eval_episodes: int = 100
     """Episodes of the final evaluation; 0: none, and no pictures."""
     eval_deterministic: bool = True
     """Evaluate the mean action rather than sampled ones."""
     video: bool = True
     """Draw pictures and a video of the evaluation, where headless rendering works."""
+    wandb: str | None = None
+    """Also log to this project of Weights & Biases (needs the extra `wandb`)."""
+    mlflow: str | None = None
+    """Also log to this experiment of MLflow (needs the extra `mlflow`)."""
 
     @property
     def steps_per_iteration(self) -> int:
-        """Policy steps gathered by one iteration."""
+        """Policy steps that each agent gathers in one iteration."""
         return self.num_envs * self.unroll_length
 
     @property
     def num_iterations(self) -> int:
         """Iterations that reach `num_timesteps`."""
         return -(-self.num_timesteps // self.steps_per_iteration)
+
+    @property
+    def groups(self) -> int:
+        """Groups of environments: the most, up to `num_groups`, that divide evenly."""
+        return max(
+            n
+            for n in range(1, self.num_groups + 1)
+            if self.num_groups % n == 0
+            and self.num_envs % n == 0
+            and self.num_envs // n * self.unroll_length % self.num_minibatches == 0
+        )
 
 
 # May differ between a run and its continuation; everything else defines the run.
@@ -101,9 +132,14 @@ RESUMABLE = frozenset(
         "run_dir",
         "resume",
         "overwrite",
+        "allow_changes",
+        "num_devices",
         "log_interval",
         "checkpoint_interval",
         "checkpoints_kept",
+        "keep_every",
+        "wandb",
+        "mlflow",
         "eval_episodes",
         "eval_deterministic",
         "video",
@@ -111,9 +147,11 @@ RESUMABLE = frozenset(
 )
 AT_LEAST_ONE = (
     "num_envs",
+    "num_seeds",
     "num_timesteps",
     "unroll_length",
     "num_minibatches",
+    "num_groups",
     "num_updates_per_batch",
     "log_interval",
     "checkpoint_interval",
@@ -129,6 +167,7 @@ NOT_NEGATIVE = (
     "entropy_cost",
     "vf_coefficient",
     "target_kl",
+    "keep_every",
     "eval_episodes",
     "seed",
 )
@@ -182,6 +221,13 @@ def validate(config: TrainConfig, known_envs: Iterable[str]) -> TrainConfig:
             f"{config.steps_per_iteration} does not divide into num_minibatches = "
             f"{config.num_minibatches} equal parts"
         )
+    if config.num_devices is not None and config.num_devices < 1:
+        raise ConfigError(f"num_devices must be at least 1, is {config.num_devices}")
+    if config.keep_every % config.checkpoint_interval:
+        raise ConfigError(
+            f"keep_every = {config.keep_every} is no multiple of checkpoint_interval = "
+            f"{config.checkpoint_interval}"
+        )
     if config.resume and config.run_dir and config.resume != config.run_dir:
         raise ConfigError("resume continues in its own folder: leave run_dir out")
     if config.resume and config.overwrite:
@@ -199,9 +245,25 @@ def differing_fields(old: TrainConfig, new: TrainConfig) -> dict[str, tuple]:
     }
 
 
+def write_text(path: Path, text: str) -> None:
+    """Replace a file in one move: a killed process leaves the old or the new."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
 def save_config(config: TrainConfig, path: Path) -> None:
     """Write a configuration as JSON."""
-    path.write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
+    write_text(path, json.dumps(dataclasses.asdict(config), indent=2) + "\n")
+
+
+def config_of(saved: dict[str, Any]) -> TrainConfig:
+    """A configuration from the values that JSON gives back."""
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in saved.items()
+    }
+    return TrainConfig(**values)
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -211,12 +273,7 @@ def load_config(path: Path) -> TrainConfig:
         ConfigError: The file is missing, is not JSON, or has unknown fields.
     """
     try:
-        saved = json.loads(path.read_text())
-        values: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in saved.items()
-        }
-        return TrainConfig(**values)
+        return config_of(json.loads(path.read_text()))
     except FileNotFoundError as error:
         raise ConfigError(f"{path.parent} is no run folder: no {path.name}") from error
     except (json.JSONDecodeError, AttributeError, TypeError) as error:

@@ -1,19 +1,25 @@
 """Evaluation: parallel episodes, one each, and what they say."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import PRNGKeyArray
 
 from rmp_mjx.training import episodes, recording
 from rmp_mjx.training.networks import Agent
 from rmp_mjx.training.recording import Recording
 from rmp_mjx.training.rollout import Env, cast_like, finite_step, select
-from rmp_mjx.training.stats import bootstrap_mean, clopper_pearson, mean_sd
+from rmp_mjx.training.stats import (
+    bootstrap_mean,
+    clopper_pearson,
+    interquartile_mean,
+    mean_sd,
+)
 
 Episodes = dict[str, np.ndarray]
 """One value per episode: `return`, `length`, `lost` (non-finite), and every metric."""
@@ -47,15 +53,27 @@ def record_episodes(
     Returns:
         Arrays of shape (n,), and the recording.
     """
-    run = jax.jit(partial(_run, env, agent, num_episodes, min(recorded, num_episodes)))
-    results, tape = jax.device_get(run(key))
+    return recorder(env, num_episodes, recorded)(agent, key)
+
+
+def recorder(
+    env: Env, num_episodes: int, recorded: int
+) -> Callable[[Agent, PRNGKeyArray], tuple[Episodes, Recording]]:
+    """`record_episodes` for several agents; compiled once for those of one network."""
+    run = jax.jit(partial(_run, env, num_episodes, min(recorded, num_episodes)))
     steps = min(env.episode_length, recording.MAX_STEPS)
-    lengths = np.minimum(results["length"][:recorded].astype(int), steps)
-    return results, Recording(tape, lengths)
+
+    def record(agent: Agent, key: PRNGKeyArray) -> tuple[Episodes, Recording]:
+        bound = agent if isinstance(agent, Partial) else Partial(agent)
+        results, tape = jax.device_get(run(bound, key))
+        lengths = np.minimum(results["length"][:recorded].astype(int), steps)
+        return results, Recording(tape, lengths)
+
+    return record
 
 
 def _run(
-    env: Env, agent: Agent, num: int, recorded: int, key: PRNGKeyArray
+    env: Env, num: int, recorded: int, agent: Agent, key: PRNGKeyArray
 ) -> tuple[dict[str, Any], Any]:
     kinds = env.metric_reductions
     key_reset, key_act = jax.random.split(key)
@@ -137,3 +155,30 @@ def summarise(results: Episodes, reductions: Mapping[str, str]) -> dict[str, Any
             summary[f"{name}_p95"] = float(np.percentile(values, 95))
             summary[f"{name}_max"] = float(values.max())
     return summary
+
+
+def over_seeds(summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Statistics over the evaluations of several training seeds.
+
+    Counts add up; every other number becomes its interquartile mean over the seeds,
+    with a 95 % bootstrap interval over the seeds (`..._ci95`) where a single
+    evaluation has an interval, and `return_sd` is the deviation between seeds.
+
+    Args:
+        summaries: What `summarise` says of each seed.
+
+    Returns:
+        JSON-ready values by the same names.
+    """
+    combined: dict[str, Any] = {}
+    for name, first in summaries[0].items():
+        values = np.array([summary[name] for summary in summaries])
+        if isinstance(first, int):
+            combined[name] = int(values.sum())
+        elif isinstance(first, float):
+            combined[name] = float(interquartile_mean(values))
+            if f"{name}_ci95" in summaries[0]:
+                interval = bootstrap_mean(values, statistic=interquartile_mean)
+                combined[f"{name}_ci95"] = list(interval)
+    means = np.array([summary["return_mean"] for summary in summaries])
+    return combined | {"seeds": len(summaries), "return_sd": mean_sd(means)[1]}

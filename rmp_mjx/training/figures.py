@@ -10,6 +10,8 @@ import numpy as np
 import polars as pl
 from jaxtyping import Float
 
+from rmp_mjx.training.metrics import SEED
+
 GROUPS = ("episode/", "per_1000_steps/")
 HIDDEN = ("episode/finished",)
 FORCES = np.geomspace(0.1, 1e4, 26)
@@ -31,22 +33,39 @@ def _figure(path: Path, lines: int, columns: int, size: tuple[float, float]):
     figure.savefig(path, dpi=120)
 
 
-def plot_learning_curve(metrics: Path, picture: Path, title: str) -> None:
+def curves(rows: pl.DataFrame) -> list[str]:
+    """Columns of a run's metrics that are worth a curve."""
+    return [n for n in rows.columns if n.startswith(GROUPS) and n not in HIDDEN]
+
+
+def plot_learning_curve(
+    metrics: Path, picture: Path, title: str, seeds: pl.DataFrame | None = None
+) -> None:
     """Plot every per-episode mean and event rate over the policy steps.
 
     Args:
         metrics: Parquet file of a run.
         picture: PNG file to write.
         title: Heading.
+        seeds: Curves over the seeds, where there are several (`metrics.over_seeds`):
+            they stand out, with their intervals, from those of the seeds.
     """
     rows = pl.read_parquet(metrics)
-    names = [n for n in rows.columns if n.startswith(GROUPS) and n not in HIDDEN]
+    names = curves(rows)
+    runs = [rows] if seeds is None else rows.partition_by(SEED)
     columns = 3
     lines = -(-len(names) // columns)
     with _figure(picture, lines, columns, (4.0, 2.4)) as (figure, axes):
         for name, axis in zip(names, axes, strict=False):
-            shown = rows.select("steps", name).drop_nulls()
-            axis.plot(shown["steps"], shown[name], lw=1.2)
+            for run in runs:
+                shown = run.select("steps", name).drop_nulls()
+                thin = {"lw": 1.2} if seeds is None else {"lw": 0.5, "color": "0.7"}
+                axis.plot(shown["steps"], shown[name], **thin)
+            if seeds is not None and name in seeds.columns:
+                band = seeds.select("steps", "^" + name + "(_low|_high)?$").drop_nulls()
+                steps, middle, low, high = band.get_columns()
+                axis.fill_between(steps, low, high, color=COLORS[0], alpha=0.3, lw=0)
+                axis.plot(steps, middle, lw=1.4, color=COLORS[0])
             axis.set_title(name.replace("_", " "), fontsize=9)
             axis.tick_params(labelsize=8)
             axis.grid(alpha=0.3)

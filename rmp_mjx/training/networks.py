@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import linen
+from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray
 
 Agent = Callable[[Float[Array, "b n"], PRNGKeyArray], Float[Array, "b m"]]
@@ -65,18 +66,22 @@ def make_networks(
 def make_agent(
     networks: ppo_networks.PPONetworks, normalizer, policy_params, deterministic: bool
 ) -> Agent:
-    """Bind parameters to a function from observations to clipped actions."""
+    """Bind parameters to a function from observations to clipped actions.
+
+    The agent is a pytree of its parameters: it can be an argument of a compiled
+    function, which then serves other parameters too.
+    """
     distribution = networks.parametric_action_distribution
 
-    def act(obs, key):
-        logits = networks.policy_network.apply(normalizer, policy_params, obs)
+    def act(normalizer, params, obs, key):
+        logits = networks.policy_network.apply(normalizer, params, obs)
         if deterministic:
             action = distribution.mode(logits)
         else:
             action = distribution.sample(logits, key)
         return jnp.clip(action, -1.0, 1.0)
 
-    return act
+    return Partial(act, normalizer, policy_params)
 
 
 def zero_agent(action_size: int) -> Agent:

@@ -3,12 +3,17 @@
 `make_ppo` returns `init(key)`, then an iteration in its two halves, `gather(state)`
 and `learn(state, data)`, and whole, `iterate(state)`. All that training needs to go
 on is in the `TrainState` between them, so a restored state continues as if it had
-never been interrupted. jit, vmap over seeds and sharding are the caller's. The halves
-exist because a simulator that runs as a host callback keeps its program out of the
-persistent compile cache: on its own, the learner is compiled once per machine.
+never been interrupted. jit and vmap over seeds are the caller's (`seeds.programs`). The
+halves exist because a simulator that runs as a host callback keeps its program out of
+the persistent compile cache: on its own, the learner is compiled once per machine.
+
+Neither half depends on the number of devices: each environment has its own random
+stream, and minibatches take equal shares of each of `config.groups` groups of
+environments, so that a device that holds whole groups never needs another's data.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,9 +22,10 @@ import optax
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.networks import PPONetworks
 from flax import struct
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from rmp_mjx.training import rollout, value_scale
+from rmp_mjx.training import devices, rollout, value_scale
 from rmp_mjx.training.advantages import generalised_advantages
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.loss import Batch, ppo_loss, weighted_mean
@@ -64,6 +70,11 @@ class TrainState:
 Metrics = dict[str, Float[Array, ""]]
 
 
+def take(x: Float[Array, "n *s"], index: Int[Array, " m"]) -> Float[Array, "m *s"]:
+    """Rows of an array."""
+    return x[index]
+
+
 class PPO(NamedTuple):
     """The functions of one training problem."""
 
@@ -81,7 +92,7 @@ class PPO(NamedTuple):
     """Both, one after the other."""
 
 
-def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
+def make_ppo(env: rollout.Env, config: TrainConfig, mesh: Mesh | None = None) -> PPO:
     """Build PPO for an environment.
 
     The first iteration only gathers the observation statistics: networks are not
@@ -90,10 +101,12 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
     Args:
         env: Single environment.
         config: Validated configuration.
+        mesh: Devices that share the environments; one by default.
 
     Returns:
         The networks and the functions.
     """
+    mesh = mesh or devices.make_mesh(config.groups, 1)
     networks = make_networks(
         env.observation_size,
         env.action_size,
@@ -106,6 +119,10 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
             optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5)
         )
         for rate in (config.learning_rate, config.value_learning_rate)
+    )
+
+    start = devices.per_environment(
+        partial(rollout.init, env, staggered=True), mesh, (0,), 0
     )
 
     def init(key: PRNGKeyArray) -> TrainState:
@@ -124,7 +141,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
                 running_statistics.init_state(jnp.zeros(env.observation_size)),
             ),
             scale=value_scale.init(),
-            rollout=rollout.init(env, config.num_envs, key_env, staggered=True),
+            rollout=start(jax.random.split(key_env, config.num_envs)),
             key=key,
             iteration=jnp.int32(0),
         )
@@ -168,15 +185,23 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
         learner = Learner(policy, value, policy_opt, value_opt)
         return (learner, may_update, policy_may), parts
 
+    def grouped(x):
+        """(t, b, ...) to (group, rows, ...), each group where its environments are."""
+        t, b, *rest = x.shape
+        x = x.reshape(t, config.groups, b // config.groups, *rest).swapaxes(0, 1)
+        x = x.reshape(config.groups, -1, *rest)
+        return jax.lax.with_sharding_constraint(x, devices.placed(mesh, 0))
+
     def update(learner, normalizer, batch: Batch, key, may_update):
-        size = config.steps_per_iteration
+        groups, rows = batch.advantage.shape
 
         def epoch(carry, key):
-            order = jax.random.permutation(key, size)
-            order = order.reshape(config.num_minibatches, -1)
+            keys = jax.random.split(key, groups)
+            order = jax.vmap(jax.random.permutation, (0, None))(keys, rows)
+            order = order.reshape(groups, config.num_minibatches, -1).swapaxes(0, 1)
             carry, parts = jax.lax.scan(
                 lambda c, i: minibatch_step(
-                    normalizer, c, jax.tree.map(lambda x: x[i], batch)
+                    normalizer, c, jax.tree.map(lambda x: jax.vmap(take)(x, i), batch)
                 ),
                 carry,
                 order,
@@ -202,24 +227,28 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
         metrics["kl"] = parts["kl"][-1]
         return learner, metrics
 
-    def gather(state: TrainState):
-        key, key_unroll = jax.random.split(state.key)
-
-        def act(obs, key):
-            logits = networks.policy_network.apply(
-                state.normalizer, state.learner.policy, obs
-            )
-            raw = distribution.sample_no_postprocessing(logits, key)
+    def unroll(params, state, keys):
+        def act(obs, keys):
+            logits = networks.policy_network.apply(*params, obs)
+            raw = jax.vmap(distribution.sample_no_postprocessing)(logits, keys)
             extras = {
                 "raw_action": raw,
                 "log_prob": distribution.log_prob(logits, raw),
             }
             return jnp.clip(raw, -1.0, 1.0), extras
 
-        roll, data, stats = rollout.unroll(
-            env, act, state.rollout, key_unroll, config.unroll_length
+        return rollout.unroll(env, act, state, keys, config.unroll_length)
+
+    unroll = devices.per_environment(unroll, mesh, (None, 0, 0), (0, 1, 0))
+
+    def gather(state: TrainState):
+        key, key_unroll = jax.random.split(state.key)
+        roll, data, stats = unroll(
+            (state.normalizer, state.learner.policy),
+            state.rollout,
+            jax.random.split(key_unroll, config.num_envs),
         )
-        return state.replace(rollout=roll, key=key), data, stats
+        return state.replace(rollout=roll, key=key), data, rollout.total(stats)
 
     def learn(state: TrainState, data: rollout.Transition):
         key, key_learn = jax.random.split(state.key)
@@ -252,7 +281,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig) -> PPO:
             target=scale.normalise(targets),
             weight=data.weight,
         )
-        batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+        batch = jax.tree.map(grouped, batch)
         learner, metrics = update(
             learner, normalizer, batch, key_learn, state.iteration > 0
         )

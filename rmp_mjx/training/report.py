@@ -1,7 +1,7 @@
 """What an evaluation leaves for its reader: a table, eval.json, plots."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from rmp_mjx.training import figures, run_folder
-from rmp_mjx.training.evaluate import Episodes, summarise
+from rmp_mjx.training.evaluate import Episodes, over_seeds, summarise
 
 Summary = Mapping[str, Any]
 Columns = Mapping[str, Summary]
@@ -134,4 +134,27 @@ def save(
         found = {k: values[metric] for k, values in results.items() if metric in values}
         if found:
             plot(found, folder / name, title)
+    return columns
+
+
+def save_over_seeds(
+    seeds: Sequence[Columns], about: Mapping[str, Any], folder: Path
+) -> Columns:
+    """Write the `eval.json` of several seeds, whose own stand in folders below.
+
+    Args:
+        seeds: What `save` returned for each seed.
+        about: What was evaluated, and how.
+        folder: Where the file goes.
+
+    Returns:
+        Statistics over the seeds by engine.
+    """
+    columns = {
+        name: {**over_seeds([columns[name] for columns in seeds]), "engine": name}
+        for name in seeds[0]
+    }
+    own, *_ = columns.values()
+    path = folder / run_folder.EVALUATION
+    path.write_text(json.dumps({**own, **about}, indent=2) + "\n")
     return columns

@@ -1,17 +1,26 @@
-"""Batched rollouts: time limit, full resets, exact episode statistics."""
+"""Batched rollouts: time limit, full resets, exact episode statistics.
+
+Every environment has a random stream of its own and nothing here looks across the
+batch, so that a batch may be cut into pieces, one a device, without any change. The
+one exception is a short cut: resets are skipped in steps where nobody needs one.
+"""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from rmp_mjx.training import episodes
+from rmp_mjx.training import episodes, faults
 
 VALUE_LIMIT = 1e6
 """Observations or rewards beyond this magnitude count as non-finite."""
+
+NONFINITE = "nonfinite"
+"""Metric by which an environment says that it has become non-finite."""
 
 
 class Env(Protocol):
@@ -61,6 +70,8 @@ class RolloutState:
     """Unfinished episodes."""
     age: Int[Array, " b"]
     """Policy steps towards the time limit."""
+    fault: faults.Fault
+    """Steps of the last unroll that became non-finite."""
 
 
 @struct.dataclass
@@ -87,20 +98,20 @@ class Transition:
 
 @struct.dataclass
 class RolloutStats:
-    """Sums over the steps and the finished episodes of an unroll."""
+    """Sums over the steps and the finished episodes of an unroll, by environment."""
 
-    episodes: Int[Array, ""]
+    episodes: Int[Array, "*b"]
     """Finished episodes, those lost to a non-finite state not included."""
-    episode_sums: dict[str, Float[Array, ""]]
+    episode_sums: dict[str, Float[Array, "*b"]]
     """Sum over them of `return`, `length` and every metric."""
-    step_sums: dict[str, Float[Array, ""]]
+    step_sums: dict[str, Float[Array, "*b"]]
     """Sum over all steps of every metric that is a sum (events)."""
-    nonfinite: Int[Array, ""]
+    nonfinite: Int[Array, "*b"]
     """Steps that became non-finite."""
 
 
 Act = Callable[
-    [Float[Array, "b n"], PRNGKeyArray],
+    [Float[Array, "b n"], Key[Array, " b"]],
     tuple[Float[Array, "b m"], dict[str, Array]],
 ]
 
@@ -130,6 +141,8 @@ def finite_step(
 ) -> tuple[Any, Bool[Array, " b"]]:
     """Step every environment; a non-finite one ends, with reward and metrics 0.
 
+    An environment may find out by itself and report it as its metric `nonfinite`.
+
     Returns:
         The new states and a mask of those that are finite. The observation of the
         others is the old one.
@@ -137,6 +150,8 @@ def finite_step(
     new = jax.vmap(env.step)(env_state, action)
     bounded = (jnp.abs(new.obs) < VALUE_LIMIT).all(-1)  # False for NaN too
     finite = bounded & (jnp.abs(new.reward) < VALUE_LIMIT)
+    if NONFINITE in new.metrics:
+        finite &= new.metrics[NONFINITE] < 0.5
     return new.replace(
         obs=jnp.where(finite[:, None], new.obs, env_state.obs),
         reward=jnp.where(finite, new.reward, 0.0),
@@ -148,44 +163,70 @@ def finite_step(
     ), finite
 
 
-def init(
-    env: Env, num_envs: int, key: PRNGKeyArray, staggered: bool = False
-) -> RolloutState:
+def init(env: Env, keys: Key[Array, " b"], staggered: bool = False) -> RolloutState:
     """Reset a batch of environments.
 
     Args:
         env: The environment.
-        num_envs: Size of the batch.
-        key: Randomness of the starts.
+        keys: Randomness of each start.
         staggered: Cut the first episodes off at random times, so that a batch of
             transitions shows all phases of an episode rather than one. A cut is a
             truncation: the value beyond it still counts. The statistics of finished
             episodes leave out those that only this cut ended.
     """
-    env_state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    keys_start, keys_age = split(keys)
+    env_state = jax.vmap(env.reset)(keys_start)
     env_state = cast_like(env_state, env_state)
-    fold = episodes.start(env.metric_reductions, (num_envs,))
-    age = jnp.zeros(num_envs, jnp.int32)
+    fold = episodes.start(env.metric_reductions, keys.shape)
+    age = jnp.zeros(keys.shape, jnp.int32)
     if staggered:
-        key_age = jax.random.fold_in(key, num_envs)
-        age = jax.random.randint(key_age, (num_envs,), 0, env.episode_length)
-    return RolloutState(env_state=env_state, fold=fold, age=age)
+        draw = partial(jax.random.randint, shape=(), minval=0)
+        age = jax.vmap(partial(draw, maxval=env.episode_length))(keys_age)
+    fault = faults.none(env_state, keys.shape[0], env.action_size)
+    return RolloutState(env_state=env_state, fold=fold, age=age, fault=fault)
 
 
-def init_stats(env: Env) -> RolloutStats:
+def split(keys: Key[Array, " b"]) -> tuple[Key[Array, " b"], Key[Array, " b"]]:
+    """Two streams of each environment's one."""
+    pairs = jax.vmap(jax.random.split)(keys)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def init_stats(env: Env, num_envs: int) -> RolloutStats:
     """Sums before the first step."""
     kinds = env.metric_reductions
-    zero = jnp.zeros((), jnp.float32)
+    zero, none = jnp.zeros(num_envs, jnp.float32), jnp.zeros(num_envs, jnp.int32)
     return RolloutStats(
-        episodes=jnp.int32(0),
+        episodes=none,
         episode_sums=dict.fromkeys(("return", "length", *kinds), zero),
         step_sums={name: zero for name, kind in kinds.items() if kind == "sum"},
-        nonfinite=jnp.int32(0),
+        nonfinite=none,
     )
 
 
+def total(stats: RolloutStats) -> RolloutStats:
+    """The sums over all environments."""
+    return jax.tree.map(lambda x: jnp.sum(x, dtype=x.dtype), stats)
+
+
+@jax.custom_batching.custom_vmap
+def _anyone(mask: Bool[Array, " b"]) -> Bool[Array, ""]:
+    """Whether a mask holds anywhere, in any lane of an outer vmap too.
+
+    A `cond` on it stays a branch under vmap, where it would otherwise become a
+    select that always pays for both sides.
+    """
+    return mask.any()
+
+
+@_anyone.def_vmap
+def _anyone_vmap(axis_size: int, in_batched: list[bool], mask: Bool[Array, "k b"]):
+    del axis_size, in_batched
+    return _anyone(mask.reshape(-1)), False
+
+
 def unroll(
-    env: Env, act: Act, state: RolloutState, key: PRNGKeyArray, length: int
+    env: Env, act: Act, state: RolloutState, keys: Key[Array, " b"], length: int
 ) -> tuple[RolloutState, Transition, RolloutStats]:
     """Let a policy act for some steps in every environment.
 
@@ -193,10 +234,10 @@ def unroll(
 
     Args:
         env: The environment.
-        act: Batched policy: (observation, key) -> (action, extras), the extras
-            with `raw_action` and `log_prob`.
+        act: Batched policy: (observations, a key for each) -> (actions, extras), the
+            extras with `raw_action` and `log_prob`.
         state: Where the environments stand.
-        key: Randomness of actions and resets.
+        keys: Randomness of each environment's actions and resets.
         length: Number of steps T.
 
     Returns:
@@ -204,15 +245,19 @@ def unroll(
     """
     kinds = env.metric_reductions
 
-    def reset_done(done, env_state, key):
-        fresh = jax.vmap(env.reset)(jax.random.split(key, done.shape[0]))
+    def reset_done(done, env_state, keys):
+        fresh = jax.vmap(env.reset)(keys)
         return select(done, cast_like(fresh, env_state), env_state)
 
-    def step(carry, key):
+    def note_fault(fault, bad, env_state, action):
+        new = faults.Fault(bad, env_state, action)
+        return select(bad & ~fault.happened, new, fault)
+
+    def step(carry, t):
         state, stats = carry
-        key_act, key_reset = jax.random.split(key)
+        keys_act, keys_reset = split(jax.vmap(jax.random.fold_in, (0, None))(keys, t))
         obs = state.env_state.obs
-        action, extras = act(obs, key_act)
+        action, extras = act(obs, keys_act)
         new, finite = finite_step(env, state.env_state, action)
         fold = episodes.update(state.fold, new.reward, new.metrics, kinds)
         termination = new.done > 0.5
@@ -221,16 +266,15 @@ def unroll(
         finished = done & finite & (termination | (age == fold.length))
         values = episodes.finish(fold, kinds)
         stats = RolloutStats(
-            episodes=stats.episodes + finished.sum(dtype=jnp.int32),
+            episodes=stats.episodes + finished.astype(jnp.int32),
             episode_sums={
-                name: total + jnp.where(finished, values[name], 0.0).sum()
-                for name, total in stats.episode_sums.items()
+                name: sums + jnp.where(finished, values[name], 0.0)
+                for name, sums in stats.episode_sums.items()
             },
             step_sums={
-                name: total + new.metrics[name].sum()
-                for name, total in stats.step_sums.items()
+                name: sums + new.metrics[name] for name, sums in stats.step_sums.items()
             },
-            nonfinite=stats.nonfinite + (~finite).sum(dtype=jnp.int32),
+            nonfinite=stats.nonfinite + (~finite).astype(jnp.int32),
         )
         transition = Transition(
             obs=obs,
@@ -242,16 +286,26 @@ def unroll(
             truncation=(done & ~termination).astype(jnp.float32),
             weight=finite.astype(jnp.float32),
         )
+        fault = jax.lax.cond(
+            _anyone(~finite),
+            note_fault,
+            lambda fault, *_: fault,
+            state.fault,
+            ~finite,
+            state.env_state,
+            action,
+        )
         new = cast_like(new, state.env_state)
         env_state = jax.lax.cond(
-            done.any(), reset_done, lambda done, s, key: s, done, new, key_reset
+            _anyone(done), reset_done, lambda done, s, keys: s, done, new, keys_reset
         )
         fold = episodes.restart(fold, done, kinds)
         age = jnp.where(done, 0, age)
-        state = RolloutState(env_state=env_state, fold=fold, age=age)
+        state = RolloutState(env_state=env_state, fold=fold, age=age, fault=fault)
         return (state, stats), transition
 
-    (state, stats), transitions = jax.lax.scan(
-        step, (state, init_stats(env)), jax.random.split(key, length)
-    )
+    clean = jnp.zeros_like(state.fault.happened)
+    state = state.replace(fault=state.fault.replace(happened=clean))
+    stats = init_stats(env, keys.shape[0])
+    (state, stats), transitions = jax.lax.scan(step, (state, stats), jnp.arange(length))
     return state, transitions, stats

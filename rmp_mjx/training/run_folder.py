@@ -14,12 +14,14 @@ from typing import IO
 
 import jax
 
+from rmp_mjx.training import trackers
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
     differing_fields,
     load_config,
     save_config,
+    write_text,
 )
 
 CONFIG = "config.json"
@@ -27,7 +29,11 @@ VERSIONS = "versions.json"
 METRICS = "metrics.parquet"
 CHECKPOINTS = "checkpoints"
 TENSORBOARD = "tensorboard"
+NONFINITE = "nonfinite"
+TRACKED = ("wandb_run", "mlflow_run", "wandb")
 CURVE = "learning_curve.png"
+SEEDS = "seeds"
+SEED_CURVES = f"{SEEDS}/curves.parquet"
 EVALUATION = "eval.json"
 EPISODES = "episodes.parquet"
 FORCES = "contact_forces.png"
@@ -53,7 +59,10 @@ RESULTS = (
     METRICS,
     CHECKPOINTS,
     TENSORBOARD,
+    NONFINITE,
+    *TRACKED,
     CURVE,
+    SEEDS,
     EVALUATION,
     EPISODES,
     FORCES,
@@ -84,12 +93,19 @@ def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
         ConfigError: The folder has results already, belongs to another
             configuration, cannot be written, or another process uses it.
     """
+    trackers.check(config)
     if config.resume:
         folder = Path(config.resume)
         different = differing_fields(load_config(folder / CONFIG), config)
         if different:
             changes = ", ".join(f"{k}: {a} -> {b}" for k, (a, b) in different.items())
             raise ConfigError(f"a resumed run keeps its configuration ({changes})")
+        newer = changed_software(folder)
+        if newer and not config.allow_changes:
+            raise ConfigError(
+                f"not what this run was trained with: {', '.join(newer)}; "
+                "--allow_changes resumes it all the same, though not exactly"
+            )
     else:
         folder = Path(config.run_dir) if config.run_dir else default_run_dir(config)
     try:
@@ -136,32 +152,57 @@ def describe(folder: Path, config: TrainConfig) -> list[str]:
         bit-identical to an uninterrupted one only where this is empty.
     """
     save_config(config, folder / CONFIG)
+    history, now = _history(folder), versions()
+    write_text(folder / VERSIONS, json.dumps([*history, now], indent=2) + "\n")
+    return changes_since(history, now)
+
+
+def _history(folder: Path) -> list[dict[str, str]]:
+    """Versions that a run was started and continued with."""
     path = folder / VERSIONS
-    history = json.loads(path.read_text()) if path.exists() else []
-    now = versions()
-    path.write_text(json.dumps([*history, now], indent=2) + "\n")
+    try:
+        return json.loads(path.read_text()) if path.exists() else []
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path} is damaged ({error}): delete it to go on") from error
+
+
+def changed_software(folder: Path) -> list[str]:
+    """What is not as it was when a run was last continued; starts no JAX backend."""
+    return changes_since(_history(folder), software())
+
+
+def changes_since(history: list[dict[str, str]], now: dict[str, str]) -> list[str]:
+    """What differs from the last of the earlier versions."""
     before = history[-1] if history else now
     return [
         f"{name} {before.get(name)} -> {now[name]}"
         for name in (*PACKAGES, "python", "git", "device")
-        if before.get(name) != now[name]
+        if name in now and before.get(name) != now[name]
     ]
 
 
-def versions() -> dict[str, str]:
-    """What this process runs on: packages, code, device, command line."""
+def software() -> dict[str, str]:
+    """Versions of the packages and of this code; starts no JAX backend."""
     found = {}
     for name in PACKAGES:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             found[name] = "not installed as a package"
-    device = jax.devices()[0]
+    return {"python": platform.python_version(), **found, "git": _git_revision()}
+
+
+def device(count: int) -> str:
+    """Number and kind of devices."""
+    first = jax.devices()[0]
+    return f"{count} x {first.device_kind} ({first.platform})"
+
+
+def versions() -> dict[str, str]:
+    """What this process runs on: packages, code, device, command line."""
     return {
-        "python": platform.python_version(),
-        **found,
-        "git": _git_revision(),
-        "device": f"{jax.device_count()} x {device.device_kind} ({device.platform})",
+        **software(),
+        "device": device(jax.device_count()),
         "machine": f"{platform.platform()}, {os.cpu_count()} CPUs",
         "command": " ".join(sys.argv),
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),

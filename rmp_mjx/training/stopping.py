@@ -1,7 +1,14 @@
-"""Stopping on a signal: finish the iteration, save, then go."""
+"""Why training stops early: a signal, or because it cannot go on."""
 
+import os
 import signal
 from types import FrameType
+
+STOPPING = b"stopping after this iteration; a second signal exits at once\n"
+
+
+class TrainingFailure(RuntimeError):
+    """Training cannot go on; the message says why and how to continue."""
 
 
 class StopRequest:
@@ -23,7 +30,9 @@ class StopRequest:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.signal = number
-        signal.signal(number, signal.SIG_DFL)
+        for each in self._previous:
+            signal.signal(each, signal.SIG_DFL)
+        os.write(2, STOPPING)  # a handler may not touch the terminal's buffers
 
     def __enter__(self) -> "StopRequest":
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -2,32 +2,27 @@
 
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 from rich.console import Console
 
-from rmp_mjx.training import run_folder
-from rmp_mjx.training.checkpoint import Checkpointer
+from rmp_mjx.training import devices, distributed, run_folder, seeds
+from rmp_mjx.training.checkpoint import NEWEST, Checkpointer
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.logging import RunLogger
-from rmp_mjx.training.metrics import Row, make_row
+from rmp_mjx.training.metrics import make_rows
 from rmp_mjx.training.networks import Agent, make_agent
 from rmp_mjx.training.ppo import PPO, TrainState, make_ppo
 from rmp_mjx.training.rollout import Env
-from rmp_mjx.training.stopping import StopRequest
-
-MAX_LOST_FRACTION = 0.5
-"""Training stops where more of an iteration's steps than this become non-finite."""
-
+from rmp_mjx.training.saving import Saver
+from rmp_mjx.training.stopping import StopRequest, TrainingFailure
+from rmp_mjx.training.trackers import open_trackers
+from rmp_mjx.training.watch import Watch, is_finite
 
 Note = Callable[[str], None]
-
-
-class TrainingFailure(RuntimeError):
-    """Training cannot go on; the last good checkpoint is kept."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +30,8 @@ class TrainResult:
     """How a call of `train` ended."""
 
     agent: Agent
-    """The policy, as the configuration's evaluation wants it."""
+    """The policy, as the configuration's evaluation wants it; stacked, if there are
+    several seeds (`seeds.of_seed`)."""
     iterations: int
     """Finished iterations."""
     exit_code: int
@@ -60,106 +56,119 @@ def train(
 
     Raises:
         CheckpointError: The run to continue has no usable checkpoint.
-        TrainingFailure: The simulation or the learner became non-finite.
+        TrainingFailure: The simulation or the learner became non-finite, or nothing
+            can be saved.
     """
-    ppo = make_ppo(env, config)
-    gather = jax.jit(ppo.gather, donate_argnums=0)
-    learn = jax.jit(ppo.learn, donate_argnums=0)
-    checkpoints = Checkpointer(folder / run_folder.CHECKPOINTS, config.checkpoints_kept)
+    mesh = devices.make_mesh(config.groups, config.num_devices)
+    ppo = make_ppo(env, config, mesh)
+    programs = seeds.programs(ppo, config, mesh)
+    primary = distributed.is_primary()
     console = console or Console()
-    state, done = _start(ppo, config, checkpoints, console)
-    changes = run_folder.describe(folder, config)
+    checkpoints = None
+    if primary or config.resume:
+        kept = config.checkpoints_kept
+        place = folder / run_folder.CHECKPOINTS
+        checkpoints = Checkpointer(place, kept, config.keep_every, not primary)
+    state, done = _start(ppo, programs, config, checkpoints, console)
+    changes = run_folder.describe(folder, config) if primary else []
+    console.print(f"training on {run_folder.device(mesh.size)}", highlight=False)
     if changes:
         console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)
-    logger = RunLogger(
-        folder / run_folder.METRICS,
-        folder / run_folder.TENSORBOARD,
-        config.num_iterations,
-        done,
-        console,
-    )
-    first = saved = done
-    with StopRequest() as stop, logger:
-        while done < config.num_iterations and not stop.signal:
+    logger = None
+    if primary:
+        logger = RunLogger(
+            folder / run_folder.METRICS,
+            config.num_iterations,
+            done,
+            console,
+            open_trackers(
+                config,
+                folder,
+                folder / run_folder.TENSORBOARD,
+                done * config.steps_per_iteration if config.resume else None,
+            ),
+        )
+    note = logger.note if logger else console.print
+    saver = Saver(checkpoints if primary else None, folder, note, done)
+    watch = Watch(config, folder, note)
+    first = done
+    stopping = 0
+    with StopRequest() as stop, logger or nullcontext():
+        while done < config.num_iterations and not stopping:
             began = time.monotonic()
-            state, data, stats = gather(state)
-            state, learning = learn(state, data)
+            state, data, stats = programs.gather(state)
+            state, learning = programs.learn(state, data)
             jax.block_until_ready(state)
             done += 1
-            row = make_row(
-                done,
-                done * config.steps_per_iteration,
-                config.steps_per_iteration,
-                time.monotonic() - began,
-                stats,
-                learning,
-            )
+            seconds = time.monotonic() - began
+            rows = make_rows(config, done, seconds, stats, learning)
             last = done == config.num_iterations
-            if last or done % config.log_interval == 0:
-                logger.add(row)
-            _check(row, config, folder)
-            if last or stop.signal or done % config.checkpoint_interval == 0:
-                checkpoints.save(done, state)
-                saved = done
-    checkpoints.close()
-    if stop.signal:
+            if logger and (last or done % config.log_interval == 0):
+                logger.add(*rows)
+            saver.count(rows)
+            fault = None
+            if any(row["nonfinite_envs"] for row in rows):
+                fault = distributed.collected(state.rollout.fault, mesh)
+            if primary:
+                watch.look(rows, fault)
+            broken = watch.verdict(rows)
+            stopping = distributed.largest(stop.signal or 0)
+            final = bool(last or stopping or broken)
+            if final or done % config.checkpoint_interval == 0:
+                if logger:
+                    logger.flush()
+                if not broken or is_finite(state):
+                    saver.save(done, distributed.collected(state, mesh), final)
+            if broken:
+                raise TrainingFailure(f"{broken}; {saver.how_to_continue()}")
+    if checkpoints:
+        checkpoints.close()
+    if stopping:
         console.print(
-            f"stopped after iteration {done}, saved {saved}; continue with\n"
-            f"  python train.py --resume {folder}",
+            f"stopped after iteration {done}; {saver.how_to_continue()}",
             markup=False,
             highlight=False,
         )
-    agent = make_agent(
-        ppo.networks,
-        state.normalizer,
-        state.learner.policy,
-        config.eval_deterministic,
-    )
+    normalizer, policy = jax.device_get((state.normalizer, state.learner.policy))
     return TrainResult(
-        agent=agent,
+        agent=make_agent(ppo.networks, normalizer, policy, config.eval_deterministic),
         iterations=done,
-        exit_code=stop.exit_code,
+        exit_code=128 + stopping if stopping else 0,
         had_finished=first >= config.num_iterations,
     )
 
 
 def _start(
-    ppo: PPO, config: TrainConfig, checkpoints: Checkpointer, console: Console
+    ppo: PPO,
+    programs: seeds.Programs,
+    config: TrainConfig,
+    checkpoints: Checkpointer | None,
+    console: Console,
 ) -> tuple[TrainState, int]:
     """The first state, new or restored, and the iterations behind it."""
-    key = jax.random.key(config.seed)
-    if not config.resume:
-        state = jax.jit(ppo.init)(key)
-        return jax.tree.map(jnp.copy, state), 0  # donation wants distinct buffers
-    template = jax.eval_shape(ppo.init, key)
-    done, state = checkpoints.restore(template, console.print)
+    nothing = config.resume and checkpoints and not checkpoints.steps
+    if nothing:
+        console.print(f"{config.resume} has nothing saved yet and begins anew")
+    if checkpoints is None or not config.resume or nothing:
+        # donation wants distinct buffers
+        return programs.place(programs.init(seeds.keys(config))), 0
+    done, state = checkpoints.restore(seeds.shapes(ppo, config), console.print)
     if done >= config.num_iterations:
         console.print(
             f"{config.resume} has finished: {done} iterations; "
             "a larger --num_timesteps continues it"
         )
-    return state, done
-
-
-def _check(row: Row, config: TrainConfig, folder: Path) -> None:
-    """Stop before a broken iteration is saved."""
-    updates = config.num_updates_per_batch * config.num_minibatches
-    lost = int(row["nonfinite_steps"] or 0)
-    skipped = int(row["learning/skipped_updates"] or 0)
-    if lost > MAX_LOST_FRACTION * config.steps_per_iteration:
-        cause = f"{lost} of {config.steps_per_iteration} steps became non-finite"
-    elif skipped >= updates:
-        cause = f"all {updates} updates had non-finite gradients"
-    else:
-        return
-    raise TrainingFailure(
-        f"iteration {row['iteration']}: {cause}; "
-        f"the last good checkpoint is in {folder / run_folder.CHECKPOINTS}"
-    )
+    return programs.place(state), done
 
 
 def load_agent(
-    env: Env, config: TrainConfig, folder: Path, deterministic: bool, note: Note
+    env: Env,
+    config: TrainConfig,
+    folder: Path,
+    deterministic: bool,
+    note: Note,
+    seed_index: int = 0,
+    checkpoint: str = NEWEST,
 ) -> tuple[int, Agent]:
     """Read the policy of a run.
 
@@ -169,6 +178,8 @@ def load_agent(
         folder: Run folder.
         deterministic: Act with the mean action.
         note: Called with one line for each damaged checkpoint.
+        seed_index: Which of the agents, where the run trained several seeds.
+        checkpoint: `newest`, `best`, or a number.
 
     Returns:
         Iterations behind the policy, and the policy.
@@ -177,15 +188,15 @@ def load_agent(
         CheckpointError: There is no usable checkpoint.
     """
     ppo = make_ppo(env, config)
-    whole = jax.eval_shape(ppo.init, jax.random.key(0))
+    whole = seeds.shapes(ppo, config)
     learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)
     needed = whole.replace(
         learner=learner, scale=None, rollout=None, key=None, iteration=None
     )
     checkpoints = Checkpointer(folder / run_folder.CHECKPOINTS, read_only=True)
-    step, state = checkpoints.restore(needed, note)
+    step, state = checkpoints.restore(needed, note, checkpoint)
     checkpoints.close()
-    agent = make_agent(
+    stacked = make_agent(
         ppo.networks, state.normalizer, state.learner.policy, deterministic
     )
-    return step, agent
+    return step, seeds.of_seed(stacked, seed_index, config)

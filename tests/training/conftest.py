@@ -1,10 +1,14 @@
 """Runs on a toy task that several test modules look at."""
 
+import jax
+import numpy as np
 import pytest
 from rich.console import Console
 
 from rmp_mjx.training import run_folder
+from rmp_mjx.training.checkpoint import Checkpointer
 from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.ppo import make_ppo
 from rmp_mjx.training.train import train
 from tests.training import toys
 
@@ -31,6 +35,23 @@ def run(folder, console=None, **changes):
     with lock:
         console = console or Console(quiet=True)
         return train(toys.Counter(), config, folder, console), config
+
+
+def bits(leaf):
+    """A leaf's bytes; of a key, its data's."""
+    if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    return np.asarray(leaf).tobytes()
+
+
+def newest_state(folder, config):
+    """Number and state of the newest checkpoint of a counting toy's run."""
+    ppo = make_ppo(toys.Counter(), config)
+    template = jax.eval_shape(ppo.init, jax.random.key(0))
+    store = Checkpointer(folder / run_folder.CHECKPOINTS, read_only=True)
+    step, state = store.restore(template, pytest.fail)
+    store.close()
+    return step, state
 
 
 @pytest.fixture(scope="session")

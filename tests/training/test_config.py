@@ -27,7 +27,7 @@ def test_the_defaults_are_valid():
     [
         ({"env": "trajectroy"}, "known: door, trajectory. Did you mean 'trajectory'"),
         ({"controller": "pid"}, "known: rmp_vices, vices"),
-        ({"physics": "bullet"}, "known: auto, mujoco, mjx"),
+        ({"physics": "bullet"}, "known: auto, mujoco, mjx, warp"),
         ({"env_options": ("physics=mjx",)}, "an option of its own: --physics"),
         ({"num_envs": 0}, "num_envs must be at least 1"),
         ({"num_envs": 3, "unroll_length": 5}, "3 * 5 = 15 does not divide into"),
@@ -35,6 +35,7 @@ def test_the_defaults_are_valid():
         ({"learning_rate": float("nan")}, "learning_rate must be positive"),
         ({"discounting": 1.5}, r"discounting must lie in [0, 1]"),
         ({"hidden_sizes": ()}, "hidden_sizes"),
+        ({"keep_every": 30}, "keep_every = 30 is no multiple of checkpoint_interval"),
         ({"resume": "a", "run_dir": "b"}, "leave run_dir out"),
         ({"resume": "a", "overwrite": True}, "exclude each other"),
     ],
@@ -112,6 +113,32 @@ def test_evaluation_needs_a_run_or_an_agent():
     (config,), out = cli.EvalConfig(agent="random", env="door").resolve()
     assert config.env == "door"
     assert str(out) == "runs/random-door-rmp_vices"
+
+
+def test_an_agent_that_the_run_does_not_have_is_refused(tmp_path):
+    save_config(TrainConfig(num_seeds=3), tmp_path / "config.json")
+    cli.EvalConfig(run=str(tmp_path), seed_index=2).resolve()
+    with pytest.raises(ConfigError, match=r"0 \.\. 2, the agents of the run; is 3"):
+        cli.EvalConfig(run=str(tmp_path), seed_index=3).resolve()
+
+
+def test_a_grid_is_resumed_with_the_options_it_was_started_with(tmp_path):
+    folder = tmp_path / "grid"
+    options = [
+        "--envs",
+        "trajectory,door",
+        "--controllers",
+        "vices",
+        "--num_envs",
+        "64",
+    ]
+    started = cli.parse_train([*options, "--run_dir", str(folder)]).grid
+    started.save({})
+    resumed = cli.parse_train(["--resume", str(folder)]).grid
+    assert list(resumed.cells()) == ["trajectory-vices", "door-vices"]
+    cell = resumed.cells()["door-vices"]
+    assert (cell.num_envs, cell.env, cell.controller) == (64, "door", "vices")
+    assert validate(cell, ENVS).run_dir == str(folder / "door-vices")
 
 
 def test_evaluation_adds_its_options_to_the_runs_and_the_engine_to_both(tmp_path):

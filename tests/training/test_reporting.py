@@ -24,9 +24,7 @@ def rows(first, last):
 
 def log(path, first, last, total=20, console=None):
     console = console or Console(file=io.StringIO(), width=200)
-    with RunLogger(
-        path / "m.parquet", path / "tb", total, first - 1, console
-    ) as logger:
+    with RunLogger(path / "m.parquet", total, first - 1, console) as logger:
         for row in rows(first, last):
             logger.add(row)
 

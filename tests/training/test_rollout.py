@@ -11,18 +11,20 @@ from tests.training import toys
 NUM_ENVS, LENGTH = 8, 12
 
 
-def act(obs, key):
-    raw = jax.random.normal(key, (obs.shape[0], 1))
+def act(obs, keys):
+    raw = jax.vmap(lambda key: jax.random.normal(key, (1,)))(keys)
     return raw, {"raw_action": raw, "log_prob": raw[:, 0]}
 
 
 def unroll_twice(env):
     def run(key):
-        state = rollout.init(env, NUM_ENVS, key)
-        state, first, a = rollout.unroll(env, act, state, key, LENGTH)
-        _, second, b = rollout.unroll(env, act, state, jax.random.key(7), LENGTH)
+        keys = jax.random.split(key, NUM_ENVS)
+        others = jax.random.split(jax.random.key(7), NUM_ENVS)
+        state = rollout.init(env, keys)
+        state, first, a = rollout.unroll(env, act, state, keys, LENGTH)
+        _, second, b = rollout.unroll(env, act, state, others, LENGTH)
         data = jax.tree.map(lambda *x: jnp.concatenate(x), first, second)
-        return data, jax.tree.map(jnp.add, a, b)
+        return data, rollout.total(jax.tree.map(jnp.add, a, b))
 
     return jax.device_get(jax.jit(run)(jax.random.key(0)))
 
@@ -115,10 +117,12 @@ def test_staggered_starts_spread_the_time_limit_and_count_whole_episodes_only():
 
     @jax.jit
     def run(key):
-        state = rollout.init(env, 64, key, staggered=True)
-        return state, rollout.unroll(env, act, state, key, 3 * limit)
+        keys = jax.random.split(key, 64)
+        state = rollout.init(env, keys, staggered=True)
+        _, data, stats = rollout.unroll(env, act, state, keys, 3 * limit)
+        return state, data, rollout.total(stats)
 
-    start, (_, data, stats) = jax.device_get(run(jax.random.key(0)))
+    start, data, stats = jax.device_get(run(jax.random.key(0)))
     assert len(np.unique(start.age)) == limit
     ends = (data.truncation + data.termination) > 0
     first = np.argmax(ends, axis=0)

@@ -3,38 +3,21 @@
 import io
 import json
 import os
+import shutil
 import signal
 
 import jax
-import numpy as np
 import polars as pl
 import pytest
 from rich.console import Console
 
 from rmp_mjx.training import run_folder
 from rmp_mjx.training import train as train_module
-from rmp_mjx.training.checkpoint import Checkpointer
 from rmp_mjx.training.config import ConfigError, TrainConfig, load_config
 from rmp_mjx.training.logging import RunLogger
-from rmp_mjx.training.ppo import make_ppo
 from rmp_mjx.training.stopping import StopRequest
 from tests.training import toys
-from tests.training.conftest import ITERATIONS, SMALL, run
-
-
-def newest_state(folder, config):
-    ppo = make_ppo(toys.Counter(), config)
-    template = jax.eval_shape(ppo.init, jax.random.key(0))
-    store = Checkpointer(folder / run_folder.CHECKPOINTS, read_only=True)
-    step, state = store.restore(template, pytest.fail)
-    store.close()
-    return step, state
-
-
-def bits(leaf):
-    if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    return np.asarray(leaf).tobytes()
+from tests.training.conftest import ITERATIONS, SMALL, bits, newest_state, run
 
 
 def test_a_run_leaves_its_configuration_versions_metrics_and_checkpoints(finished):
@@ -110,12 +93,78 @@ def test_a_run_that_becomes_nonfinite_stops_and_names_the_checkpoints(tmp_path):
     assert not list((folder / run_folder.CHECKPOINTS).glob("[0-9]*"))
 
 
-def test_a_second_signal_meets_the_default_handler():
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_of_either_kind_meets_the_default_handler(first):
+    before = signal.getsignal(signal.SIGINT)
     with StopRequest() as stop:
-        os.kill(os.getpid(), signal.SIGINT)
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    assert stop.exit_code == 128 + signal.SIGINT
-    assert signal.getsignal(signal.SIGINT) is not signal.SIG_DFL
+        os.kill(os.getpid(), first)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            assert signal.getsignal(number) is signal.SIG_DFL
+    assert stop.exit_code == 128 + first
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def copy_of(finished, tmp_path):
+    """A finished run to spoil."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished[0], folder)
+    return folder
+
+
+def resume(folder, **changes):
+    said = io.StringIO()
+    console = Console(file=said, width=200)
+    result, config = run(folder, console, run_dir=None, resume=str(folder), **changes)
+    return result, config, said.getvalue()
+
+
+def test_a_run_that_was_killed_before_its_first_save_begins_anew(finished, tmp_path):
+    folder = copy_of(finished, tmp_path)
+    shutil.rmtree(folder / run_folder.CHECKPOINTS)
+    result, config, said = resume(folder)
+    assert "nothing saved yet and begins anew" in said
+    assert "training on " in said
+    assert result.iterations == ITERATIONS
+    one, two = (newest_state(f, config)[1] for f in (folder, finished[0]))
+    assert jax.tree.map(bits, one) == jax.tree.map(bits, two)
+    rows = pl.read_parquet(folder / run_folder.METRICS)
+    assert rows["iteration"].to_list() == [1, 2, 3, 4]
+
+
+def test_damaged_metrics_are_begun_anew_and_the_run_goes_on(finished, tmp_path):
+    folder = copy_of(finished, tmp_path)
+    (folder / run_folder.METRICS).write_bytes(b"no parquet")
+    steps = 64 * (ITERATIONS + 1)
+    result, _, said = resume(folder, num_timesteps=steps)
+    assert "cannot be read and is begun anew" in said
+    assert result.iterations == ITERATIONS + 1
+    assert pl.read_parquet(folder / run_folder.METRICS)["iteration"].to_list() == [5]
+
+
+def test_a_run_goes_on_with_what_it_was_trained_with_unless_told(finished, tmp_path):
+    folder = copy_of(finished, tmp_path)
+    path = folder / run_folder.VERSIONS
+    versions, *_ = json.loads(path.read_text())
+    path.write_text(json.dumps([versions | {"brax": "0.0.1", "device": "an abacus"}]))
+    with pytest.raises(ConfigError, match=r"brax 0\.0\.1 -> .*; --allow_changes"):
+        resume(folder)
+    result, _, said = resume(folder, allow_changes=True)
+    assert result.had_finished
+    assert "not an exact continuation: brax 0.0.1" in said and "an abacus" in said
+
+
+def test_the_policy_of_any_kept_checkpoint_can_be_read(finished):
+    folder, _, config = finished
+    obs = jax.numpy.ones((1, 3))
+    actions = {}
+    for which in ("newest", "best", "2", "4"):
+        iteration, agent = train_module.load_agent(
+            toys.Counter(), config, folder, True, pytest.fail, checkpoint=which
+        )
+        actions[which] = iteration, float(agent(obs, jax.random.key(0))[0, 0])
+    assert actions["newest"] == actions["4"]
+    assert actions["best"] in (actions["2"], actions["4"])
+    assert actions["2"] != actions["4"]
 
 
 def test_a_folder_with_results_is_refused_unless_they_may_go(tmp_path):

@@ -161,3 +161,26 @@ class Exploding(Toy):
         bad = jnp.where(state.obs[0] > 0.5, jnp.nan, 0.0)
         reward = 1.0 - jnp.abs(action[0] - 0.5) + bad
         return self._state(state.data, state.obs + bad, reward, 1.0, action)
+
+
+@dataclasses.dataclass(frozen=True)
+class Poisoned(Counter):
+    """As `Counter`; some starts are bad at their second step.
+
+    Then `poison` is added to observation and reward, or, with `flag`, the environment
+    reports itself.
+    """
+
+    poison: float = 0.0
+    flag: bool = False
+
+    @property
+    def metric_reductions(self):
+        return super().metric_reductions | {"nonfinite": "max"}
+
+    def _state(self, data, obs, reward, done, action=0.0):
+        bad = (obs[1] == 2.0) & (obs[2] < 0.1)
+        poison = jnp.where(bad, self.poison, 0.0)
+        state = super()._state(data, obs + poison, reward + poison, done, action)
+        said = jnp.float32(bad & self.flag)
+        return dataclasses.replace(state, metrics=state.metrics | {"nonfinite": said})
