@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -53,16 +53,28 @@ class Group(NamedTuple):
     """Layout of the spheres; None for no spheres."""
     limit: int = 1024
     """Policy steps after which an episode ends."""
+    spheres: int | None = None
+    """How many of the scene's spheres there are; None: all."""
+    speed: float | None = None
+    """Their speed [m/s]; None: the environment's."""
+    noise: float | None = None
+    """Error of their positions that the controller is told [m]; None likewise."""
+    delay: float | None = None
+    """Age of those [s]; None likewise."""
+    torque: float = 1.0
+    """Share of the arm's torque limits that the controller may use."""
 
 
 @struct.dataclass
 class World:
-    """One environment and its policy's memory."""
+    """One environment, its policy's memory, and what is special about it."""
 
     state: State
     """Environment."""
     memory: Array
     """The policy's memory."""
+    special: dict[str, Array]
+    """Its group's `spheres`, `speed`, `noise`, `delay` and `torque`."""
 
 
 class Study:
@@ -87,6 +99,8 @@ class Study:
             **options: The task's; two spheres unless it says otherwise.
         """
         self.groups, self.steps = tuple(groups), steps
+        speed = max(group.speed or 0.0 for group in self.groups)
+        options = {"obstacle_speed": speed} | options
         options = {"obstacles": SPHERES, "sphere_radius": RADIUS} | options
         self.env = envs.load(task, controller=controller, **options)
         self._run = jax.jit(self._simulate)
@@ -109,16 +123,14 @@ class Study:
     def _simulate(self, parts: dict[str, Any], key: Array) -> dict[str, Array]:
         env = copy.copy(self.env)
         env.controller = env.controller.replace(**parts)
-        count = np.array([g.worlds for g in self.groups])
-        each = lambda values: np.repeat(np.array(values), count)  # noqa: E731
         names = tuple(POLICIES)
-        policy = jnp.array(each([names.index(g.policy) for g in self.groups]))
-        limit = each([g.limit for g in self.groups])
+        policy = jnp.array(self._each(lambda g: names.index(g.policy)))
+        limit = self._each(lambda g: g.limit)
 
         def one(worlds: World, key: Array) -> tuple[World, dict[str, Array]]:
             key_act, key_reset = jax.random.split(key)
             keys = jax.random.split(key_act, len(policy))
-            worlds, figures = jax.vmap(lambda *x: _advance(env, *x))(
+            worlds, figures = jax.vmap(lambda *x: advance(env, *x))(
                 worlds, keys, policy
             )
             over = (worlds.state.done > 0) | (worlds.state.info["step"] >= limit)
@@ -138,35 +150,86 @@ class Study:
 
     def _fresh(self, key: Array, policy: Array) -> World:
         """Worlds at the start of an episode, each in its group's layout."""
-        parts = []
-        for i, group in enumerate(self.groups):
+        split = lambda i, g: jax.random.split(jax.random.fold_in(key, i), g.worlds)  # noqa: E731
+        keys = jnp.concatenate([split(i, g) for i, g in enumerate(self.groups)])
+        special = self._special()
+        layouts = self._each(lambda g: g.layout or self.env.options.layout)
+        parts, order = [], []
+        for layout in np.unique(layouts):  # one reset in the program for each
             env = copy.copy(self.env)
-            layout = group.layout or self.env.options.layout
-            env.options = dataclasses.replace(env.options, layout=layout)
-            keys = jax.random.split(jax.random.fold_in(key, i), group.worlds)
-            state = jax.vmap(env.reset)(keys)
-            parts.append(state if group.layout else _without_spheres(state))
-        state = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-        keys = jax.random.split(jax.random.fold_in(key, len(parts)), len(policy))
+            env.options = dataclasses.replace(env.options, layout=str(layout))
+            chosen = np.flatnonzero(layouts == layout)
+            parts.append(
+                jax.vmap(lambda k, v, env=env: _traced(env, obstacle_speed=v).reset(k))(
+                    keys[chosen], special["speed"][chosen]
+                )
+            )
+            order.append(chosen)
+        back = np.argsort(np.concatenate(order))
+        state = jax.tree.map(lambda *x: jnp.concatenate(x)[back], *parts)
+        state = jax.vmap(_with_spheres)(state, special["spheres"])
+        keys = jax.random.fold_in(key, len(self.groups))
+        keys = jax.random.split(keys, len(policy))
 
         def memory(key: Array, policy: Array) -> Array:
             starts = [make().start(key) for make in POLICIES.values()]
             return jnp.stack(starts)[policy]
 
-        return World(state, jax.vmap(memory)(keys, policy))
+        return World(state, jax.vmap(memory)(keys, policy), special)
+
+    def _special(self) -> dict[str, Array]:
+        """What is special about each world, (worlds,) each."""
+        env, asked = self.env, self.env.options
+        special = {
+            "spheres": lambda g: _or(g.spheres, env.scene.spheres) if g.layout else 0,
+            "speed": lambda g: _or(g.speed, asked.obstacle_speed),
+            "noise": lambda g: _or(g.noise, asked.obstacle_noise),
+            "delay": lambda g: _or(g.delay, asked.obstacle_delay),
+            "torque": lambda g: g.torque,
+        }
+        return {name: jnp.array(self._each(value)) for name, value in special.items()}
+
+    def _each(self, value: Callable[[Group], Any]) -> np.ndarray:
+        """A value of each world's group, (worlds,)."""
+        count = [group.worlds for group in self.groups]
+        return np.repeat([value(group) for group in self.groups], count)
 
 
-def _without_spheres(state: State) -> State:
-    """The same worlds, their spheres out of the way."""
-    spheres = state.info["spheres"]
+def _or(value: Any, default: Any) -> Any:
+    return default if value is None else value
+
+
+def _with_spheres(state: State, count: Array) -> State:
+    """The same world, all spheres but the first `count` out of the way."""
+    spheres, centers = state.info["spheres"], state.data.mocap_pos
+    kept = jnp.arange(len(centers)) < count
     spheres = spheres.replace(
-        placed=jnp.zeros_like(spheres.placed), velocity=0.0 * spheres.velocity
+        placed=spheres.placed & kept,
+        velocity=jnp.where(kept[:, None], spheres.velocity, 0.0),
     )
-    away = jnp.broadcast_to(jnp.array(AWAY), state.data.mocap_pos.shape)
+    centers = jnp.where(kept[:, None], centers, jnp.array(AWAY))
     return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-        data=state.data.replace(mocap_pos=away),  # pyright: ignore[reportAttributeAccessIssue]
+        data=state.data.replace(mocap_pos=centers),  # pyright: ignore[reportAttributeAccessIssue]
         info=state.info | {"spheres": spheres},
     )
+
+
+def _traced(env: ArmEnv, **values: Array) -> ArmEnv:
+    """The environment with traced options, which their own check could not read."""
+    env, options = copy.copy(env), copy.copy(env.options)
+    for name, value in values.items():
+        object.__setattr__(options, name, value)
+    env.options = options
+    return env
+
+
+def under(env: ArmEnv, special: dict[str, Array]) -> ArmEnv:
+    """The environment with a world's noise, delay and torque limits."""
+    env = _traced(env, obstacle_noise=special["noise"], obstacle_delay=special["delay"])
+    robot = env.controller.robot
+    robot = robot.replace(tau_max=special["torque"] * robot.tau_max)  # pyright: ignore[reportAttributeAccessIssue]
+    env.controller = env.controller.replace(robot=robot)
+    return env
 
 
 def _pick(mask: Array, new: Any, old: Any) -> Any:
@@ -177,7 +240,7 @@ def _pick(mask: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(pick, new, old)
 
 
-def _to_target(env: ArmEnv, state: State) -> Array:
+def to_target(env: ArmEnv, state: State) -> Array:
     """From the grip to the via point it is to reach; zero in tasks without one."""
     if "points" not in state.info:
         return jnp.zeros(3)
@@ -199,13 +262,13 @@ def _to_obstacle(env: ArmEnv, state: State) -> Array:
     return direction
 
 
-def _advance(
+def advance(
     env: ArmEnv, world: World, key: Array, policy: Array
 ) -> tuple[World, dict[str, Array]]:
     """One policy step: the world, and the step's figures."""
-    state = world.state
+    state, env = world.state, under(env, world.special)
     site = env.site(state.data)
-    view = View(_to_target(env, state), _to_obstacle(env, state))
+    view = View(to_target(env, state), _to_obstacle(env, state))
     acts = [make().act(world.memory, key, view) for make in POLICIES.values()]
     memory, action = (jnp.stack(column)[policy] for column in zip(*acts, strict=True))
     after = env.step(state, action)
@@ -219,4 +282,4 @@ def _advance(
     }
     good = after.metrics["nonfinite"] == 0
     figures = {k: jnp.where(good, v, 0.0) for k, v in figures.items()}
-    return World(after, memory), figures | after.metrics
+    return World(after, memory, world.special), figures | after.metrics

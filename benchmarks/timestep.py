@@ -19,7 +19,7 @@ import numpy as np
 
 import envs
 from benchmarks.common import Row, show, write_json
-from envs.safety import Torques, observe
+from envs.safety import Motion, Torques, observe
 from rmp_mjx import runtime
 from rmp_mjx.robot.kinematics import site_pose
 from rmp_mjx.sim import PhysicsState, load_physics, read_contacts
@@ -108,7 +108,8 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
             after = env.physics.step(data, out.tau)
             torques = torques.then(out.tau)
             scale = out.diagnostics["torque_scale"]
-            now = observe(env.scene, env.robot, after, torques, scale)
+            motion = Motion.none(after.qvel[:n])  # its jerk is not asked for
+            now = observe(env.scene, env.robot, after, torques, motion, scale)
             jump = jnp.maximum(jump, now.torque_jump)
             force = jnp.maximum(force, now.force_peak)
             return (after, torques, event | now.event, force, jump), None

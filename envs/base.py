@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from envs import options
 from envs.placement import place_spheres
-from envs.safety import SafetyRecord, Torques, observe
+from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, Contacts, build_scene, no_objects
 from envs.spheres import AWAY, Spheres
 from envs.types import ARM_ENTRIES, METRICS, SHARED, Entry, Score, State
@@ -197,6 +197,7 @@ class ArmEnv(abc.ABC):
             "torque_saturation": record.saturation,
             "torque_jump": record.torque_jump,
             "torque_reversals": record.reversals,
+            "joint_jerk": record.jerk,
             "tracking_error": jnp.linalg.norm(setpoint.p_des - site.p),
             "unplaced_obstacles": jnp.sum(~spheres.placed),
             "contact_overflow": record.overflow,
@@ -252,7 +253,7 @@ class ArmEnv(abc.ABC):
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
 
         def substep(carry, _):
-            data, spheres, torques, record = carry
+            data, spheres, torques, motion, record = carry
             seen = self.obstacles(data, spheres, error)
             out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, seen)
             if self.options.obstacle_speed and self.scene.spheres:
@@ -266,13 +267,15 @@ class ArmEnv(abc.ABC):
                 self.robot,
                 data,
                 torques := torques.then(out.tau),
+                motion := motion.then(data.qvel[:n], self.sim_dt),
                 out.diagnostics["torque_scale"],
             )
             record = record.then(now, 1.0 / self.n_substeps)
-            return (data, spheres, torques, record), None
+            return (data, spheres, torques, motion, record), None
 
-        start = (data, spheres, Torques.none(n), SafetyRecord.none())
-        (data, spheres, _, record), _ = jax.lax.scan(
+        before = Torques.none(n), Motion.none(data.qvel[:n])
+        start = (data, spheres, *before, SafetyRecord.none())
+        (data, spheres, _, _, record), _ = jax.lax.scan(
             substep, start, None, length=self.n_substeps
         )
         return data, spheres, setpoint, record

@@ -10,6 +10,8 @@ import numpy as np
 
 from envs.placement import LAYOUTS
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
+from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx.control.osc import OSC
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.mjcf import unknown
 
@@ -17,6 +19,8 @@ CONTROLLERS = {
     "rmp_vices": RMPVICES,
     "vices": VICES,
     "rmp_vices_literal": rmp_vices_literal,
+    "osc": OSC,
+    "vices_cbf": FilteredVICES,
 }
 """Controllers by name: each makes one for a robot."""
 
@@ -42,7 +46,7 @@ class Options:
     controller: Any = "rmp_vices"
     """A name in `CONTROLLERS`, or a controller object."""
     physics: str = "auto"
-    """`auto`, `mujoco` (C engine) or `mjx`."""
+    """`auto`, `mujoco` (C engine), `mjx` or `warp` (MuJoCo Warp)."""
     armature: str = "physical"
     """Rotor inertias of the Jaco 2: `physical` or `robosuite`."""
     robot: Robot | None = None

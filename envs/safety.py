@@ -37,6 +37,7 @@ NUMBERS = (
     "saturation",
     "torque_jump",
     "reversals",
+    "jerk",
 )
 """Its numbers."""
 
@@ -72,6 +73,8 @@ class SafetyRecord:
     """Largest change of a torque from one physics step to the next [N m]."""
     reversals: Float[Array, ""]
     """Share of the physics steps in which a torque turns round."""
+    jerk: Float[Array, ""]
+    """Largest jerk of a joint from one physics step to the next [rad/s^3]."""
     overflow: Bool[Array, ""]
     """A geom pair had more contacts than were read."""
 
@@ -104,6 +107,7 @@ class SafetyRecord:
             saturation=self.saturation + share * step.saturation,
             torque_jump=jnp.maximum(self.torque_jump, step.torque_jump),
             reversals=self.reversals + share * step.reversals,
+            jerk=jnp.maximum(self.jerk, step.jerk),
             overflow=self.overflow | step.overflow,
         )
 
@@ -135,11 +139,38 @@ class Torques:
         return Torques(tau, change, jnp.any(turned & large), jnp.zeros((), bool))
 
 
+@struct.dataclass
+class Motion:
+    """Velocities of the last physics steps: what the joints' jerk is read from."""
+
+    qd: Float[Array, " n"]
+    """Joint velocities [rad/s]."""
+    qdd: Float[Array, " n"]
+    """Their change in the last step, over its time [rad/s^2]."""
+    jerk: Float[Array, " n"]
+    """The change of that, over the time of a step [rad/s^3]."""
+    first: Bool[Array, ""]
+    """Whether there is no step yet."""
+
+    @staticmethod
+    def none(qd: Float[Array, " n"]) -> Motion:
+        """Before the first step with a new set-point: its jerk is the policy's."""
+        zero = jnp.zeros_like(qd)
+        return Motion(qd, zero, zero, jnp.ones((), bool))
+
+    def then(self, qd: Float[Array, " n"], dt: float) -> Motion:
+        """One step of `dt` [s] on."""
+        qdd = (qd - self.qd) / dt
+        jerk = jnp.where(self.first, 0.0, (qdd - self.qdd) / dt)
+        return Motion(qd, qdd, jerk, jnp.zeros((), bool))
+
+
 def observe(
     scene: Scene,
     robot: Robot,
     state: PhysicsState,
     torques: Torques,
+    motion: Motion,
     torque_scale: Float[Array, ""],
 ) -> SafetyRecord:
     """The record of the physics step that led to `state`."""
@@ -164,5 +195,6 @@ def observe(
         saturation=(torque_scale < 1.0).astype(q.dtype),
         torque_jump=jnp.max(jnp.abs(torques.change)),
         reversals=torques.back.astype(q.dtype),
+        jerk=jnp.max(jnp.abs(motion.jerk)),
         overflow=jnp.any(contacts.overflow),
     )

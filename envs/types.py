@@ -26,6 +26,7 @@ METRICS = {
     "torque_saturation": "mean",
     "torque_jump": "max",
     "torque_reversals": "mean",
+    "joint_jerk": "max",
     "tracking_error": "mean",
     "unplaced_obstacles": "max",
     "contact_overflow": "max",
@@ -38,7 +39,8 @@ impulse is in N s; `work_force` is the hand's on what it works with. `clearance`
 least distance of a control point to the table, a fixture or a sphere [m], at the end of
 each policy step. `torque_jump` is the largest change of a torque between two physics
 steps of a policy step [N m], `torque_reversals` the share of physics steps in which a
-torque turns round: what an oscillation does.
+torque turns round: what an oscillation does. `joint_jerk` is the largest change of a
+joint's acceleration between two of them, over the timestep [rad/s^3].
 """
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm_tasks import LANES
 
-from envs.safety import Torques
+from envs.safety import Motion, Torques
 
 DOWN, SPHERE, SIDE, LIMIT, TURN = 0, 1, 2, 3, 4  # lanes; the others rest
 REST = jnp.zeros((LANES, 12))
@@ -193,3 +193,31 @@ def test_smoothness_is_read_from_consecutive_torques():
         False,
         False,
     ]  # 3 up, 2 down; 0.5 is too little
+
+
+def test_jerk_is_the_second_difference_of_the_velocities():
+    """Of qd = t^2 and t^3 / 6: 2 and about t, at 5 ms from the second step on."""
+    dt, t = 0.005, 0.005 * np.arange(8)
+    motion, jerks = Motion.none(jnp.zeros(2)), []
+    for row in np.stack([t**2, t**3 / 6], axis=1)[1:]:
+        motion = motion.then(jnp.asarray(row, jnp.float32), dt)
+        jerks.append(np.asarray(motion.jerk))
+    np.testing.assert_array_equal(jerks[0], 0.0)  # the step before is the policy's
+    # A velocity of 1e-3 in float32 is good to 1e-10, divided by dt^2.
+    np.testing.assert_allclose(np.stack(jerks[1:])[:, 0], 2.0, atol=1e-4)
+    np.testing.assert_allclose(np.stack(jerks[1:])[:, 1], t[1:-1], atol=1e-4)
+
+
+def test_a_collision_jerks_harder_than_a_fall(close, scripted):
+    """The falling lane's jerk before and at its impact; a resting one's beside it."""
+    state, action = scripted
+    jerk, hit = [], []
+    for _ in range(6):
+        state = close.step(state, action)
+        jerk.append(np.asarray(state.metrics["joint_jerk"]))
+        hit.append(bool(state.metrics["collision"][DOWN]))
+    first = int(np.argmax(hit))
+    assert first > 0 and any(hit)
+    before, at = (float(jerk[k][DOWN]) for k in (first - 1, first))
+    assert at > 100.0 * before > 0.0
+    assert float(jerk[first][-1]) < before  # a lane that rests
