@@ -1,7 +1,8 @@
 # One command each, from a bare checkout: needs Python 3.11 with venv, and make.
 #   make train    set up if needed, then run the main job (ARGS="--seed 1" adds options)
 #   make test     set up if needed, then run the tests
-# The rest: lint type format bench docs test-latest clean.
+#   make paper    set up if needed, then run the paper's experiments (PRESET=smoke)
+# The rest: lint type format bench bench-peers bench-gate docs test-latest clean.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -16,6 +17,7 @@ PYTHON ?= $(call find,3.11)
 PYTHON312 ?= $(call find,3.12)
 JOBS ?= 2
 ARGS ?=
+PRESET ?= cpu
 
 VENV := .venv
 LATEST := .venv-latest
@@ -24,10 +26,11 @@ STAMP := $(VENV)/.installed
 LATEST_STAMP := $(LATEST)/.installed
 PIP := -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help setup train test test-slow test-latest lint format type bench docs clean
+.PHONY: help setup train paper test test-slow test-latest lint format type bench \
+  bench-peers bench-gate docs clean
 
 help:
-	@sed -n '1,4s/^#  *//p' Makefile
+	@sed -n '1,5s/^#  *//p' Makefile
 
 setup: $(STAMP)
 
@@ -42,6 +45,9 @@ $(STAMP): requirements.lock pyproject.toml
 
 train: $(STAMP)
 	$(PY) train.py $(ARGS)
+
+paper: $(STAMP)
+	$(PY) -m benchmarks.paper --preset $(PRESET) $(ARGS)
 
 test: $(STAMP)
 	$(PY) -m pytest -n $(JOBS) --dist loadfile $(ARGS)
@@ -64,6 +70,15 @@ bench: $(STAMP)
 	@mkdir -p runs/bench
 	$(PY) -m benchmarks.bench_controller --json runs/bench/controller.json $(ARGS)
 	$(PY) -m benchmarks.bench_env --json runs/bench/env.json $(ARGS)
+
+# Ours against its peers, each in an environment of its own under ~/.cache/rmp_mjx.
+bench-peers: $(STAMP)
+	@mkdir -p runs/bench
+	$(PY) -m benchmarks.peers --json runs/bench/peers.json $(ARGS)
+
+# Fails where speed is lost against benchmarks/results/gate_baseline.json.
+bench-gate: $(STAMP)
+	$(PY) -m benchmarks.gate $(ARGS)
 
 docs: $(STAMP)
 	$(PY) $(PIP) -c requirements.lock -e '.[docs]'

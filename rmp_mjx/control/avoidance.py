@@ -88,7 +88,28 @@ def _sum_obstacles(gap: Gap, leaf: ScalarLeaf) -> PointRMP:
 
 
 def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
-    r"""Collision leaves between the link capsules that can touch.
+    """Collision leaves between the link capsules that can touch.
+
+    Returns:
+        RMP on the joints; f (n,), M (n, n).
+    """
+    if not robot.capsules.pairs:
+        return RMP.zero(robot.n, arm.p.dtype)
+    distance, rate, curvature, rows = self_gaps(robot, arm)
+    f, m = leaf.scalar(distance, rate)
+    f, m, rows = store(f - m * curvature), store(m), store(rows)
+    return RMP(
+        f=jnp.sum(rows * f[:, None], axis=0),
+        M=jnp.sum((rows * m[:, None])[:, :, None] * rows[:, None, :], axis=0),
+    )
+
+
+def self_gaps(
+    robot: Robot, arm: ArmState
+) -> tuple[
+    Float[Array, " k"], Float[Array, " k"], Float[Array, " k"], Float[Array, "k n"]
+]:
+    r"""Distances of the k pairs of link capsules that can touch.
 
     The distance of two capsules depends on the joints between them only: with the
     unit force along the gap, :math:`w = (\hat n, p \times \hat n)`,
@@ -98,11 +119,9 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
         \ddot d = w^T S_{ab}\, \ddot q + w \cdot (A_a - A_b) + \dot w \cdot (V_a - V_b).
 
     Returns:
-        RMP on the joints; f (n,), M (n, n).
+        Distance [m], rate [m/s], the acceleration's part without qdd [m/s^2], gradient.
     """
     capsules, n = robot.capsules, robot.n
-    if not capsules.pairs:
-        return RMP.zero(n, arm.p.dtype)
     ids = np.array(capsules.pairs).T
     segment, radii = np.array(capsules.segment)[ids], capsules.radius[ids]
     far, near = (np.arange(n)[:, None] == s for s in segment)
@@ -122,16 +141,11 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
     (w, norm), (wdot, _) = jax.jvp(unit_wrench, (x,), (v,))
     rate = w.lin @ V.lin + w.ang @ V.ang
     curvature = w.lin @ A.lin + w.ang @ A.ang + wdot.lin @ V.lin + wdot.ang @ V.ang
-    f, m = leaf.scalar(norm - jnp.sum(radii, axis=0), rate)
     joints = np.arange(n)
     between = (joints > segment[1][:, None]) & (joints <= segment[0][:, None])
     rows = jnp.sum(w.stack()[:, :, None] * arm.S.stack()[:, None, :], axis=0)
     rows = jnp.where(between, rows, 0.0)
-    f, m, rows = store(f - m * curvature), store(m), store(rows)
-    return RMP(
-        f=jnp.sum(rows * f[:, None], axis=0),
-        M=jnp.sum((rows * m[:, None])[:, :, None] * rows[:, None, :], axis=0),
-    )
+    return norm - jnp.sum(radii, axis=0), rate, curvature, rows
 
 
 def _segment_gap(x: Vec) -> tuple[Vec, Vec, Array]:

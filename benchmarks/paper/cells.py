@@ -1,0 +1,186 @@
+"""Cells of the grid: a task, a variant of the controller, a seed."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from rmp_mjx.training.config import RESUMABLE, ConfigError, TrainConfig
+
+TASKS = {
+    "trajectory": "trajectory following",
+    "door": "door opening",
+    "push": "block pushing",
+}
+"""Tasks and what to call them."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A controller under the policy, and how it is trained."""
+
+    label: str
+    """What figures and tables call it."""
+    controller: str
+    """Its name."""
+    color: str
+    """Its colour in figures."""
+    env_options: tuple[str, ...] = ()
+    """Options of the task in training."""
+
+
+VARIANTS = {
+    "vices": Variant("VICES", "vices", "#c0504d"),
+    "rmp_vices": Variant("RMP-VICES", "rmp_vices", "#2a6fbb"),
+    "rmp_vices_literal": Variant(
+        "RMP-VICES, the paper's formulas", "rmp_vices_literal", "#d9a13b"
+    ),
+    "vices_penalty": Variant(
+        "VICES, penalty only", "vices", "#8064a2", ("terminate_on_event=False",)
+    ),
+    "osc": Variant("OSC, fixed impedance", "osc", "#7f7f7f"),
+    "vices_cbf": Variant("VICES, CBF filter", "vices_cbf", "#3a9d5d"),
+}
+"""Variants by name: the paper's two, then the baselines."""
+
+PAPER = ("vices", "rmp_vices")
+"""The variants of the paper."""
+BASELINES = tuple(name for name in VARIANTS if name not in PAPER)
+"""The others."""
+
+
+@dataclass(frozen=True, order=True)
+class Cell:
+    """One training run and its deployments."""
+
+    task: str
+    """Name of the task."""
+    variant: str
+    """Name of the variant."""
+    seed: int
+    """Seed of training."""
+
+    def __str__(self) -> str:
+        return f"{self.task}/{self.variant}/{self.seed}"
+
+    @property
+    def file(self) -> str:
+        """Its name in file names."""
+        return f"{self.task}-{self.variant}-{self.seed}"
+
+
+def parse(text: str) -> Cell:
+    """A cell from task/variant/seed.
+
+    Raises:
+        ConfigError: It is not one; the message lists the valid names.
+    """
+    parts = text.split("/")
+    if len(parts) != 3 or parts[0] not in TASKS or parts[1] not in VARIANTS:
+        raise ConfigError(
+            f"no cell {text!r}: a cell reads TASK/VARIANT/SEED; "
+            f"tasks: {', '.join(TASKS)}; variants: {', '.join(VARIANTS)}"
+        )
+    task, variant, seed = parts
+    if not seed.isdecimal():
+        raise ConfigError(f"no cell {text!r}: the seed must be a whole number")
+    return Cell(task, variant, int(seed))
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How large the experiment is."""
+
+    name: str
+    """Its name."""
+    seeds: int
+    """Seeds of the paper's variants."""
+    baseline_seeds: int
+    """Seeds of the baselines."""
+    training: TrainConfig
+    """What all cells share."""
+    episodes: int
+    """Episodes of the columns of the deployment table."""
+    other_episodes: int
+    """Episodes of the other columns."""
+    columns: tuple[str, ...]
+    """Names of the columns."""
+    env_options: tuple[str, ...] = ()
+    """Options of the tasks, in training and in deployment."""
+
+    def cells(self, baselines: bool = False) -> list[Cell]:
+        """Cells in their order: one seed of every cell, then the next."""
+        groups = [(PAPER, self.seeds)]
+        groups += [(BASELINES, self.baseline_seeds)] if baselines else []
+        return [
+            Cell(task, variant, seed)
+            for variants, seeds in groups
+            for seed in range(seeds)
+            for task in TASKS
+            for variant in variants
+        ]
+
+    def config(self, cell: Cell) -> TrainConfig:
+        """The training of a cell."""
+        variant = VARIANTS[cell.variant]
+        return dataclasses.replace(
+            self.training,
+            env=cell.task,
+            controller=variant.controller,
+            env_options=self.env_options + variant.env_options,
+            seed=cell.seed,
+        )
+
+
+def definition(config: TrainConfig) -> dict:
+    """The values that define a training: of equal ones, one is enough."""
+    values = dataclasses.asdict(config)
+    ignored = RESUMABLE - {"num_timesteps"}
+    return {name: value for name, value in values.items() if name not in ignored}
+
+
+_PROTOCOL = TrainConfig(
+    num_timesteps=1_500_000, hidden_sizes=(64, 64), eval_episodes=0, video=False
+)
+_TINY = dataclasses.replace(
+    _PROTOCOL,
+    num_envs=16,
+    unroll_length=8,
+    num_minibatches=2,
+    num_updates_per_batch=2,
+    num_timesteps=1024,
+    checkpoint_interval=4,
+)
+_COLUMNS = (
+    "close",
+    "far",
+    "free",
+    "four",
+    "moving",
+    "noise",
+    "delay",
+    "engine",
+    "armature",
+)
+
+PRESETS = {
+    "smoke": Preset(
+        name="smoke",
+        seeds=2,
+        baseline_seeds=1,
+        training=_TINY,
+        episodes=8,
+        other_episodes=4,
+        columns=("close", "free"),
+        env_options=("episode_length=32",),
+    ),
+    "cpu": Preset("cpu", 5, 3, _PROTOCOL, 1000, 100, _COLUMNS),
+    "full": Preset("full", 10, 10, _PROTOCOL, 1000, 100, _COLUMNS),
+}
+"""Presets by name."""
+
+
+def home(preset: Preset) -> Path:
+    """Where a preset's store lies unless it is told otherwise."""
+    return Path("runs/paper") / preset.name

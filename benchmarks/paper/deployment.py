@@ -1,0 +1,112 @@
+"""Deploy a trained cell in a column: every episode's values into the store."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from typing import Any
+
+import jax
+import numpy as np
+import polars as pl
+from rich.console import Console
+
+from benchmarks.common import machine
+from benchmarks.paper import cells, failures, pictures, store, tasks
+from benchmarks.paper.cells import Cell, Preset
+from benchmarks.paper.columns import COLUMNS, PICTURED, TABLE, Column
+from benchmarks.paper.store import Store
+from benchmarks.paper.training import run_of
+from rmp_mjx.training import evaluate
+from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.train import load_agent
+
+STARTS = 2000
+"""Seed of the episodes: the same in every cell, so that all meet the same worlds."""
+RECORDED = 100
+"""Episodes of the pictured column that are recorded."""
+ALIKE = ("terminate_on_event=True",)
+"""Options that no training may change: every deployed episode ends with an event."""
+
+
+def deployed(config: TrainConfig, column: Column) -> TrainConfig:
+    """A training's configuration with the world of a column."""
+    return dataclasses.replace(
+        config,
+        env_options=config.env_options + column.options + ALIKE,
+        physics=column.physics or config.physics,
+    )
+
+
+def definition(preset: Preset, cell: Cell, column: Column) -> dict[str, Any]:
+    """What a deployment depends on."""
+    config = preset.config(cell)
+    world = deployed(config, column)
+    return {
+        "training": cells.definition(config),
+        "env_options": world.env_options,
+        "physics": world.physics,
+        "episodes": episodes(preset, column),
+        "starts": STARTS,
+    }
+
+
+def episodes(preset: Preset, column: Column) -> int:
+    """Episodes of a column."""
+    return preset.episodes if column.name in TABLE else preset.other_episodes
+
+
+def is_deployed(place: Store, preset: Preset, cell: Cell, name: str) -> bool:
+    """Whether a deployment is in the store."""
+    wanted = definition(preset, cell, COLUMNS[name])
+    found = place.holds(wanted, store.EPISODES, cell, name)
+    if name == PICTURED:
+        found &= place.holds(wanted, store.EVENTS, cell, name)
+    return found
+
+
+def deploy(
+    place: Store, preset: Preset, cell: Cell, name: str, console: Console
+) -> None:
+    """Run a trained cell's mean policy in a column.
+
+    Raises:
+        CheckpointError: The run has no sound checkpoint.
+    """
+    column, config = COLUMNS[name], preset.config(cell)
+    count = episodes(preset, column)
+    filmed = min(RECORDED, count) if name == PICTURED else 0
+    env, record = _recorder(deployed(config, column), count, filmed)
+    folder = run_of(place, cell)
+    iterations, agent = load_agent(env, config, folder, True, console.print)
+    began = time.monotonic()
+    results, tape = record(agent, jax.random.key(STARTS))
+    about = {
+        "definition": definition(preset, cell, column),
+        "seconds": time.monotonic() - began,
+        "training_iterations": iterations,
+        "dt": env.dt,
+        "reductions": dict(env.metric_reductions),
+        "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "machine": machine(),
+    }
+    if filmed:
+        events = failures.describe(env, results, tape)
+        pictures.save(env, tape, events, pictures.folder(place, cell), console)
+        place.write(
+            pl.DataFrame(events, failures.SCHEMA), about, store.EVENTS, cell, name
+        )
+    values = {key: np.asarray(each, np.float32) for key, each in results.items()}
+    place.write(pl.DataFrame(values), about, store.EPISODES, cell, name)
+
+
+@functools.lru_cache(maxsize=64)
+def _world(config: TrainConfig, count: int, filmed: int):
+    env = tasks.load(config)
+    return env, evaluate.recorder(env, count, filmed)
+
+
+def _recorder(config: TrainConfig, count: int, filmed: int):
+    """The task of a configuration and its recorder, compiled once for all seeds."""
+    return _world(dataclasses.replace(config, seed=0), count, filmed)

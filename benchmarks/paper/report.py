@@ -1,0 +1,300 @@
+"""The pages of results, from the store alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from benchmarks.paper import cells, figures, measures, page, store, tables, targets
+from benchmarks.paper.cells import PAPER, TASKS, VARIANTS, Preset
+from benchmarks.paper.columns import COLUMNS, PICTURED, TABLE
+from benchmarks.paper.page import Block, Code, Heading, Picture, Text
+from benchmarks.paper.store import Store
+from rmp_mjx.training.config import write_text
+
+FIGURES = "figures"
+TITLE = "The paper's experiments, measured"
+
+
+def write(place: Store, preset: Preset, folder: Path) -> tuple[Path, Path]:
+    """Draw the figures and write both pages.
+
+    Args:
+        place: What was measured.
+        preset: The experiment.
+        folder: Where `index.md`, `index.html` and the figures go.
+
+    Returns:
+        The Markdown and the HTML page.
+
+    Raises:
+        ValueError: The store holds no finished training.
+    """
+    if place.training.is_empty():
+        raise ValueError(f"{place.folder} holds no finished training yet")
+    (folder / FIGURES).mkdir(parents=True, exist_ok=True)
+    blocks = [
+        *_summary(place, preset),
+        *_targets(place),
+        *_reproduction(place),
+        *_training(place, folder),
+        *_deployment(place, folder),
+        *_beyond(place, preset, folder),
+        *_failures(place, folder),
+        *_pictures(place, folder),
+        *_protocol(place, preset),
+    ]
+    written = folder / "index.md", folder / "index.html"
+    write_text(written[0], page.markdown(blocks))
+    write_text(written[1], page.page(blocks, TITLE, folder))
+    return written
+
+
+def _summary(place: Store, preset: Preset) -> list[Block]:
+    trained = [a for a in place.provenance if a["kind"] == store.TRAINING]
+    wanted = preset.cells()
+    done = {(a["task"], a["variant"], a["seed"]) for a in trained}
+    missing = [c for c in wanted if (c.task, c.variant, c.seed) not in done]
+    text = (
+        "Made by {command} from {runs} training runs of {steps:,} policy steps each "
+        "and {episodes:,} deployed episodes. Of the {wanted} cells of the paper's two "
+        "controllers, {missing} are not trained yet."
+    ).format(
+        command=f"python -m benchmarks.paper --preset {preset.name}",
+        runs=len(trained),
+        steps=int(place.training["steps"].max()),  # pyright: ignore
+        episodes=len(place.episodes),
+        wanted=len(wanted),
+        missing=len(missing),
+    )
+    blocks: list[Block] = [Heading(TITLE, 1), Text(text)]
+    if preset.name == "smoke":
+        blocks.append(
+            Text("This is a smoke test: its numbers mean nothing but that all runs.")
+        )
+    return blocks
+
+
+def _targets(place: Store) -> list[Block]:
+    found = targets.targets(place)
+    met, failed = (sum(t.met is value for t in found) for value in (True, False))
+    return [
+        Heading("Targets"),
+        Text(
+            f"Of {len(found)} targets {met} are met, {failed} are not, and "
+            f"{len(found) - met - failed} are undecided: not measured, measured in "
+            "fewer than 100 episodes, or with nothing to compare. A verdict goes by "
+            "the measured value; the interval says how far it can be trusted. "
+            "Intervals of changes are paired bootstraps "
+            "over seeds (from three seeds on), of shares Clopper and Pearson's."
+        ),
+        tables.of_targets(place),
+    ]
+
+
+def _reproduction(place: Store) -> list[Block]:
+    return [
+        Heading("What reproduces, and what does not"),
+        Text(
+            "Each finding of the paper, by its direction. The paper says neither how "
+            "near its spheres were nor which physics settings it used, so that its "
+            "absolute numbers cannot be expected here; deployed means among "
+            f"{COLUMNS[PICTURED].label}."
+        ),
+        tables.reproduction(place, PICTURED),
+    ]
+
+
+def _training(place: Store, folder: Path) -> list[Block]:
+    figures.training(place, folder / FIGURES / "training")
+    blocks: list[Block] = [
+        Heading("Training"),
+        Picture(
+            Path(FIGURES, "training.png"),
+            "Return, collisions and joint-limit events per episode over training: mean "
+            "over the seeds and its 95 % interval (Student's t).",
+        ),
+        Text(
+            "Area under the mean curves, as mean height, and its change from VICES to "
+            "RMP-VICES as the paper computes it, over the steps where both have "
+            "finished episodes."
+        ),
+        tables.training(place),
+        Text(
+            "Events per thousand policy steps of the whole training, which do not "
+            "depend on how long episodes last; and the speed of training, updates "
+            "included."
+        ),
+        tables.totals(place),
+    ]
+    others = sorted(set(place.training["variant"].unique()) - set(PAPER))
+    if others:
+        figures.training(
+            place, folder / FIGURES / "training_baselines", tuple(VARIANTS)
+        )
+        names = ", ".join(VARIANTS[name].label for name in others)
+        blocks.append(
+            Picture(
+                Path(FIGURES, "training_baselines.png"),
+                f"The same with the baselines: {names}.",
+            )
+        )
+    return blocks
+
+
+def _deployment(place: Store, folder: Path) -> list[Block]:
+    figures.forces(place, folder / FIGURES / "forces", PICTURED)
+    blocks: list[Block] = [
+        Heading("Deployment among unseen spheres"),
+        Text(
+            "The best seed of each variant: the greatest mean return over the last "
+            f"{measures.LAST:.0%} of training. Policies act by their mean. All meet "
+            "the same starts, goals and spheres. An event ends the episode. The "
+            "paper's column has return, collisions and joint limits of 100 episodes."
+        ),
+    ]
+    for column in TABLE:
+        table = tables.deployment(place, column)
+        if table.rows:
+            blocks += [Heading(COLUMNS[column].label, 3), table]
+    return [
+        *blocks,
+        Heading("Severity of collisions", 3),
+        Picture(
+            Path(FIGURES, "forces.png"),
+            "Greatest contact force of episodes with a contact. In deployment each "
+            "episode counts by itself. In training the record keeps means over the "
+            "episodes that finished in an iteration, so there an entry is the mean "
+            "over those of them that a contact ended, counted as often as they are. "
+            "The hand's contact with what it works on is left out.",
+        ),
+        Heading("Further measures", 3),
+        Text(f"Best seeds among {COLUMNS[PICTURED].label}; means have 95 % intervals."),
+        tables.further(place, PICTURED),
+    ]
+
+
+def _beyond(place: Store, preset: Preset, folder: Path) -> list[Block]:
+    figures.pareto(place, folder / FIGURES / "pareto")
+    figures.robustness(place, folder / FIGURES / "robustness", preset.columns)
+    return [
+        Heading("Performance against safety"),
+        Picture(
+            Path(FIGURES, "pareto.png"),
+            "Success against episodes ended by an event, best seeds, with 95 % "
+            "intervals. Up and right is better.",
+        ),
+        Heading("Robustness"),
+        Picture(
+            Path(FIGURES, "robustness.png"),
+            "Best seeds in worlds that training never saw.",
+        ),
+        Text("Success and episodes ended by an event, both in per cent."),
+        tables.robustness(place, preset.columns),
+        Heading("Every seed, and tests paired by seed"),
+        tables.seeds(place, PICTURED),
+        Text(
+            "RMP-VICES minus VICES with the same seed. The sign-flip test is exact and "
+            "makes no assumption, but with k seeds its p-value is never below 2 / 2^k. "
+            "No correction for the number of tests is made."
+        ),
+        tables.paired(place, PICTURED),
+    ]
+
+
+def _failures(place: Store, folder: Path) -> list[Block]:
+    chosen: list[pl.DataFrame] = []
+    for task in TASKS:
+        for variant in VARIANTS:
+            cell = figures.best_cell(place, task, variant)
+            if cell and not place.events.is_empty():
+                rows = {"task": task, "variant": variant, "seed": cell.seed}
+                chosen.append(measures.of(place.events, **rows))
+    events = pl.concat(chosen) if chosen else pl.DataFrame()
+    ours = measures.of(events, variant=targets.OURS)
+    blocks: list[Block] = [
+        Heading("Where it still fails"),
+        Text(
+            "What each event was that ended one of the recorded episodes (the first "
+            f"100 or fewer) of the best seeds among {COLUMNS[PICTURED].label}: "
+            f"{len(ours)} with RMP-VICES, {len(events) - len(ours)} with the others. "
+            "It is put down to the pair that is nearest when the policy step of the "
+            "event ends. Forces are normal forces; a joint limit has none."
+        ),
+    ]
+    if not events.is_empty():
+        blocks.append(tables.events(events))
+    if figures.failures(place, folder / FIGURES / "failures", events):
+        caption = "How episodes ended with RMP-VICES."
+        blocks.append(Picture(Path(FIGURES, "failures.png"), caption))
+    return blocks
+
+
+def _pictures(place: Store, folder: Path) -> list[Block]:
+    blocks: list[Block] = []
+    if figures.instances(place, folder / FIGURES / "instances"):
+        caption = f"Instances of the tasks, {COLUMNS[PICTURED].label}."
+        blocks.append(Picture(Path(FIGURES, "instances.png"), caption))
+    if figures.storyboard(place, folder / FIGURES / "storyboard", "door"):
+        caption = "Regularly timed stills of one episode of door opening."
+        blocks.append(Picture(Path(FIGURES, "storyboard.png"), caption))
+    if not blocks:
+        blocks.append(Text("There was no headless rendering where this was made."))
+    return [Heading("Pictures"), *blocks]
+
+
+def _protocol(place: Store, preset: Preset) -> list[Block]:
+    trained = [a for a in place.provenance if a["kind"] == store.TRAINING]
+    histories = [a["history"] for a in trained]
+    last = histories[-1][-1]
+    config: dict[str, Any] = trained[-1]["definition"]
+    shared = cells.definition(preset.training)
+    varied = {"env", "controller", "env_options", "seed"}
+    rows = [(k, str(v)) for k, v in shared.items() if k not in varied]
+    size = config["num_envs"] * config["unroll_length"]
+    continued = sum(len(history) > 1 for history in histories)
+    revisions = sorted({entry["git"] for history in histories for entry in history})
+    started = sorted(entry["started"] for history in histories for entry in history)
+    deployed = {str(a["machine"]["cpu"]) for a in place.provenance if "machine" in a}
+    about = [
+        ("revisions", ", ".join(revisions)),
+        ("device", last["device"]),
+        ("machine", f"{last['machine']}; {', '.join(sorted(deployed))}"),
+        ("dates", f"{started[0]} to {started[-1]}"),
+        ("runs that were stopped and continued", f"{continued} of {len(trained)}"),
+        *((k, v) for k, v in last.items() if k in ("python", "jax", "mujoco", "numpy")),
+    ]
+    return [
+        Heading("Protocol"),
+        Text(
+            "All variants train with the same settings, below; none has settings of "
+            "its own. The parameters of RMP-VICES' leaves were chosen beforehand on "
+            "policies that learned nothing; VICES has its authors' gains and was not "
+            "tuned here. As in the paper: two hidden layers of 64 with tanh, PPO, an "
+            "event ends the episode, no spheres in training. Not as in the paper: an "
+            f"iteration gathers {size:,} steps from {config['num_envs']} environments "
+            "at once; door and push last 256 policy steps instead of 1024, unless the "
+            "options below say otherwise; arm, scene and physics are this project's."
+        ),
+        Code(
+            f"python -m benchmarks.paper --preset {preset.name}\n"
+            f"python -m benchmarks.paper --preset {preset.name} "
+            "--only door/rmp_vices/0 --folder runs/again"
+        ),
+        Text(
+            "The second command repeats one cell; on the same machine and with the "
+            "same versions its fingerprint is the one below. A fingerprint is of all "
+            "values of the training curves but times."
+        ),
+        tables.runs(place),
+        page.Table(("provenance", ""), about),
+        page.Table(
+            ("setting", "value"),
+            [
+                *rows,
+                ("options of the tasks", " ".join(preset.env_options) or "default"),
+            ],
+        ),
+    ]

@@ -1,0 +1,160 @@
+"""The targets that ours is held to, each with what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from benchmarks.paper import measures, published
+from benchmarks.paper.cells import TASKS
+from benchmarks.paper.columns import COLUMNS, TABLE
+from benchmarks.paper.store import Store
+from rmp_mjx.training.stats import Interval
+
+DROP = -99.0
+"""Wanted change of events in training against VICES [%]."""
+OURS, BASE = "rmp_vices", "vices"
+
+
+@dataclass(frozen=True)
+class Target:
+    """One target in one task."""
+
+    claim: str
+    """What is wanted."""
+    task: str
+    """Task."""
+    measured: str
+    """What was measured."""
+    interval: str
+    """Its 95 % interval."""
+    met: bool | None
+    """Whether it is met; None: not measured, in fewer episodes than the paper's, or
+    with nothing to compare with."""
+
+    @property
+    def verdict(self) -> str:
+        """One word."""
+        return {True: "met", False: "NOT MET", None: "undecided"}[self.met]
+
+
+def targets(place: Store) -> list[Target]:
+    """Every target in every task, measured or not."""
+    found: list[Target] = []
+    for task in TASKS:
+        rows = measures.of(place.training, task=task)
+        for event, name in (
+            ("collision", "collisions"),
+            ("joint_limit", "joint limits"),
+        ):
+            claim = f"training: {name} at least {-DROP:.0f} % below VICES"
+            found.append(_drop(claim, task, rows, f"episode/{event}"))
+        found.append(_efficiency(task, rows))
+        for column in TABLE:
+            found += _deployed(place, task, column)
+    return found
+
+
+def pair(
+    rows: pl.DataFrame, name: str
+) -> tuple[measures.Curves, measures.Curves] | None:
+    """Curves of ours and of VICES; None where one is missing."""
+    both = [measures.of(rows, variant=variant) for variant in (OURS, BASE)]
+    if any(part.is_empty() for part in both):
+        return None
+    ours, base = (measures.curves(part, name) for part in both)
+    return ours, base
+
+
+def change(rows: pl.DataFrame, name: str) -> tuple[float, Interval | None] | None:
+    """Change of ours against VICES in the area under a training curve [%]."""
+    found = pair(rows, name)
+    if found is None:
+        return None
+    own, base = measures.areas(*found)
+    return measures.percent_change(own, base), measures.change_interval(own, base)
+
+
+def _drop(claim: str, task: str, rows: pl.DataFrame, name: str) -> Target:
+    found = change(rows, name)
+    if found is None or not np.isfinite(found[0]):
+        why = "" if found is None else "no such event under VICES"
+        return Target(claim, task, why, "", None)
+    value, interval = found
+    return Target(claim, task, f"{value:+.1f} %", _show(interval), value <= DROP)
+
+
+def _efficiency(task: str, rows: pl.DataFrame) -> Target:
+    claim = "training: area under the return's curve at least VICES'"
+    found = pair(rows, "episode/return")
+    if found is None:
+        return Target(claim, task, "", "", None)
+    own, base = (part.mean() for part in measures.areas(*found))
+    interval = None
+    ours, theirs = measures.areas(*found)
+    both = measures.paired(
+        dict(zip(found[0].seeds, ours, strict=True)),
+        dict(zip(found[1].seeds, theirs, strict=True)),
+    )
+    if both:
+        interval = both.interval
+    measured = f"{own:,.0f} against {base:,.0f}"
+    if not np.isfinite(own - base):
+        return Target(claim, task, "", "", None)
+    return Target(claim, task, measured, _show(interval, "difference "), own >= base)
+
+
+def _deployed(place: Store, task: str, column: str) -> list[Target]:
+    where = f"deployed ({COLUMNS[column].label})"
+    ours, base = (best(place, task, variant, column) for variant in (OURS, BASE))
+    claims = [
+        f"{where}: no episode ended by collision",
+        f"{where}: no episode ended by a joint limit",
+        f"{where}: mean return at least VICES'",
+        f"{where}: success at least VICES'",
+    ]
+    if ours is None or base is None:
+        return [Target(claim, task, "", "", None) for claim in claims]
+    enough = min(len(ours), len(base)) >= published.EPISODES
+    found = []
+    for claim, name in zip(claims, ("collision", "joint_limit"), strict=False):
+        rate = measures.rate(ours, name)
+        measured, interval = (
+            f"{rate.hits} of {rate.count}",
+            _show(rate.interval, "", " %"),
+        )
+        met = rate.hits == 0 if enough else None
+        found.append(Target(claim, task, measured, interval, met))
+    own, other = (measures.mean(rows, "return") for rows in (ours, base))
+    measured = f"{own.mean:,.0f} against {other.mean:,.0f}"
+    interval = f"{_show(own.interval)} against {_show(other.interval)}"
+    met = own.mean >= other.mean if enough else None
+    found.append(Target(claims[2], task, measured, interval, met))
+    own, other = (measures.rate(rows, "success") for rows in (ours, base))
+    measured = f"{own.percent:.1f} % against {other.percent:.1f} %"
+    interval = f"{_show(own.interval)} against {_show(other.interval)} %"
+    compared = enough and max(own.hits, other.hits) > 0
+    met = own.percent >= other.percent if compared else None
+    return [*found, Target(claims[3], task, measured, interval, met)]
+
+
+def best(place: Store, task: str, variant: str, column: str) -> pl.DataFrame | None:
+    """Deployed episodes of the best seed; None where it is not deployed there."""
+    rows = measures.of(place.training, task=task, variant=variant)
+    if rows.is_empty():
+        return None
+    seed = measures.best_seed(rows)
+    found = measures.of(
+        place.episodes, task=task, variant=variant, seed=seed, column=column
+    )
+    return None if found.is_empty() else found
+
+
+def _show(interval: Interval | None, before: str = "", after: str = "") -> str:
+    if interval is None:
+        return ""
+    low, high = interval
+    digits = 0 if max(abs(low), abs(high)) >= 1000.0 else 1
+    return f"{before}[{low:,.{digits}f}, {high:,.{digits}f}]{after}"

@@ -1,0 +1,116 @@
+"""Train a cell: from nothing, from where it was stopped, or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+from rich.console import Console
+
+from benchmarks.paper import cells, store, tasks
+from benchmarks.paper.cells import Cell, Preset
+from benchmarks.paper.store import Store
+from rmp_mjx.training import run_folder
+from rmp_mjx.training.checkpoint import CheckpointError
+from rmp_mjx.training.config import (
+    ConfigError,
+    TrainConfig,
+    differing_fields,
+    load_config,
+)
+from rmp_mjx.training.train import train
+
+
+def run_of(place: Store, cell: Cell) -> Path:
+    """Run folder of a cell."""
+    return place.folder / "runs" / cell.file
+
+
+def is_trained(place: Store, preset: Preset, cell: Cell) -> bool:
+    """Whether a cell's training is in the store, and its run folder still there."""
+    wanted = cells.definition(preset.config(cell))
+    config = run_of(place, cell) / run_folder.CONFIG
+    return place.holds(wanted, store.TRAINING, cell) and config.exists()
+
+
+def check(place: Store, preset: Preset, cell: Cell) -> None:
+    """Refuse a run folder of other settings before anything long starts.
+
+    Raises:
+        ConfigError: It holds another run.
+    """
+    folder = run_of(place, cell)
+    saved = _saved(folder)
+    different = differing_fields(saved, preset.config(cell)) if saved else {}
+    if different:
+        changes = ", ".join(f"{k}: {a} -> {b}" for k, (a, b) in different.items())
+        raise ConfigError(
+            f"{folder} holds {cell} with other settings ({changes}): delete it, or "
+            "name another folder with --folder"
+        )
+
+
+def train_cell(
+    place: Store, preset: Preset, cell: Cell, console: Console, allow_changes: bool
+) -> int:
+    """Train a cell to its end and put its curves into the store.
+
+    A run that was stopped goes on from its last checkpoint; one without any sound
+    checkpoint begins anew.
+
+    Returns:
+        0, or 128 plus the signal that stopped training.
+
+    Raises:
+        ConfigError: The run cannot be continued with this code.
+        TrainingFailure: The run broke down.
+    """
+    folder = run_of(place, cell)
+    wanted = preset.config(cell)
+    begin = partial(_run, wanted, folder, console, allow_changes)
+    try:
+        code = begin(_saved(folder) is not None)
+    except CheckpointError as error:
+        console.print(f"{cell} begins anew: {error}", markup=False, highlight=False)
+        code = begin(False)
+    if code:
+        return code
+    rows = pl.read_parquet(folder / run_folder.METRICS)
+    about = {
+        "definition": cells.definition(wanted),
+        "seconds": float(rows["time/iteration_s"].sum()),
+        "history": json.loads((folder / run_folder.VERSIONS).read_text()),
+    }
+    place.write(rows, about, store.TRAINING, cell)
+    return 0
+
+
+def _saved(folder: Path) -> TrainConfig | None:
+    """Configuration of the run in a folder; None: there is none that can be read."""
+    try:
+        return load_config(folder / run_folder.CONFIG)
+    except ConfigError:
+        return None
+
+
+def _run(
+    config: TrainConfig,
+    folder: Path,
+    console: Console,
+    allow_changes: bool,
+    go_on: bool,
+) -> int:
+    """Continue the run in a folder, or begin one there; its exit code."""
+    config = dataclasses.replace(
+        config,
+        allow_changes=allow_changes,
+        resume=str(folder) if go_on else None,
+        run_dir=None if go_on else str(folder),
+        overwrite=not go_on,
+    )
+    folder, lock = run_folder.open_run(config)
+    with lock:
+        return train(tasks.load(config), config, folder, console).exit_code

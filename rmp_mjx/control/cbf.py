@@ -1,0 +1,241 @@
+"""VICES behind a safety filter: a quadratic program with control-barrier functions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from rmp_mjx.control.avoidance import self_gaps
+from rmp_mjx.control.torque import clip_torque
+from rmp_mjx.control.vices import VICES
+from rmp_mjx.math import psd_solve
+from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import ArmState, arm_state, base_point
+from rmp_mjx.robot.model import Robot
+from rmp_mjx.robot.point_state import point_state
+from rmp_mjx.types import ControlOutput, Setpoint
+from rmp_mjx.vec import Vec
+
+UNIT = 30.0
+"""Size of a large correction, to scale the program by [sqrt(kg m^2) rad/s^2]."""
+TOLERANCE, ITERATIONS = 1e-4, 30
+"""Residual of the scaled program at which the solver stops, and when it gives up.
+Float32 reaches it; at ten times as much accelerations are off by some per cent."""
+LARGEST = 10.0
+"""What a barrier may ask for at most, in units of the scaled program."""
+FREE = 1e-3
+"""Rows shorter than this are left out: the joints cannot move that distance."""
+
+
+class Barriers(NamedTuple):
+    """Distances that must stay positive, with d'' = row . qdd + drift; m of them."""
+
+    distance: Float[Array, " m"]
+    """Beyond the margin [m or rad]."""
+    rate: Float[Array, " m"]
+    """Its rate."""
+    drift: Float[Array, " m"]
+    """Its acceleration while qdd = 0."""
+    rows: Float[Array, "m n"]
+    """Its gradient."""
+    active: Float[Array, " m"]
+    """Whether it counts."""
+
+
+@struct.dataclass
+class FilteredVICES(VICES):
+    r"""The acceleration that VICES' torques give, changed as little as safety needs.
+
+    .. math::
+        \min_{\ddot q} \tfrac12 \|\ddot q - \ddot q_{VICES}\|^2_{M_q}
+        \quad \text{s.t.} \quad
+        \ddot d_i + 2 \alpha \dot d_i + \alpha^2 d_i \ge 0, \quad
+        |M_q \ddot q + b| \le \tau_{max}
+
+    with a barrier on the distance of every control point to every obstacle, of the
+    links' capsules to each other, and of every joint to its limits: the same points,
+    obstacles and margins as `RMPVICES`. They have relative degree 2; the gains put both
+    poles at :math:`-\alpha`, so that a distance decays without overshoot. Where not all
+    can hold, each may be violated at a cost in proportion (an exact penalty), and the
+    torque is clipped in the end.
+
+    Needs the extra `cbf`.
+
+    Source: Nguyen and Sreenath, "Exponential control barrier functions" (2016); Khazoom
+    et al., "Humanoid self-collision avoidance using whole-body control with control
+    barrier functions" (2022).
+    """
+
+    rate: Float[Array, ""] | float = 10.0
+    """Rate alpha at which a distance may shrink [1/s]."""
+    margin: Float[Array, ""] | float = 0.005
+    """Distance that is kept [m]."""
+    limit_margin: Float[Array, ""] | float = 0.12
+    """Room that is kept to a joint's limit [rad]."""
+    penalty: Float[Array, ""] | float = 100.0
+    """Cost of a violation, in units of the scaled program."""
+
+    def __post_init__(self):
+        """Find the solver before anything long starts."""
+        _solver()
+
+    def __call__(
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+    ) -> ControlOutput:
+        """Torque for one state; same signature as `RMPVICES`.
+
+        Returns:
+            As `VICES`; diagnostics also has `solved`, 1 where the program converged.
+        """
+        tau = super().__call__(q, qd, setpoint, obstacles).tau
+        arm = arm_state(self.robot, q, qd)
+        Mq, bias = dynamics(self.robot, arm)
+        wanted = psd_solve(Mq, tau - bias)
+        barriers = self.barriers(arm, q, qd, obstacles)
+        qdd, solved = self._filter(wanted, barriers, Mq, bias)
+        dynamic = jnp.matmul(Mq, qdd, precision="highest")
+        tau, scale = clip_torque(dynamic + bias, jnp.asarray(self.robot.tau_max))
+        return ControlOutput(
+            tau=tau,
+            qdd=qdd,
+            f=dynamic,
+            M=Mq,
+            diagnostics={"torque_scale": scale, "solved": solved},
+        )
+
+    def barriers(
+        self,
+        arm: ArmState,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        obstacles: Obstacles,
+    ) -> Barriers:
+        """All distances beyond their margins, where the arm is in state q, qd."""
+        kinds = [_points(self.robot, arm, obstacles), _links(self.robot, arm)]
+        found = [_beyond(kind, self.margin) for kind in kinds if kind is not None]
+        found.append(_beyond(_joints(self.robot, q, qd), self.limit_margin))
+        return Barriers(*(jnp.concatenate(x) for x in zip(*found, strict=True)))
+
+    def _filter(
+        self,
+        wanted: Float[Array, " n"],
+        barriers: Barriers,
+        Mq: Float[Array, "n n"],
+        bias: Float[Array, " n"],
+    ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """The nearest admissible acceleration, and whether it was found.
+
+        The program's variable is the change in the inertia's norm, in units of `UNIT`,
+        and its rows have length 1.
+        """
+        need = (
+            barriers.drift
+            + 2.0 * self.rate * barriers.rate
+            + self.rate**2 * barriers.distance
+        )
+        tau_max = jnp.asarray(self.robot.tau_max, Mq.dtype)
+        low, high = ((-tau_max - bias), (tau_max - bias))
+        G = jnp.concatenate([-barriers.rows, Mq, -Mq])
+        h = jnp.concatenate([need, high, -low]) - G @ wanted
+        limits = jnp.ones(2 * self.robot.n, bool)
+        active = jnp.concatenate([barriers.active, limits])
+
+        L = jnp.linalg.cholesky(Mq)
+        G = solve_triangular(L, G.T, lower=True).T
+        length = jnp.linalg.norm(G, axis=1)
+        active &= length > FREE
+        scale = jnp.where(active, 1.0 / jnp.where(active, length, 1.0), 0.0)
+        G = G * scale[:, None]
+        h = jnp.where(active, jnp.clip(h * scale / UNIT, -LARGEST, LARGEST), 1.0)
+        n = self.robot.n
+        change, *_, converged, _ = _solver()(
+            jnp.eye(n, dtype=G.dtype),
+            jnp.zeros(n, G.dtype),
+            G,
+            h,
+            self.penalty,
+            solver_tol=TOLERANCE,
+            max_iter=ITERATIONS,
+        )
+        change = jnp.where(jnp.isfinite(change).all(), change, 0.0)
+        qdd = wanted + solve_triangular(L.T, UNIT * change, lower=False)
+        return qdd, converged.astype(qdd.dtype)
+
+
+def _beyond(barriers: Barriers, margin: Array | float) -> Barriers:
+    return barriers._replace(distance=barriers.distance - margin)
+
+
+def _points(robot: Robot, arm: ArmState, obstacles: Obstacles) -> Barriers | None:
+    """Barriers between every control point and every obstacle."""
+    if not obstacles.kinds or not robot.points.segment:
+        return None
+    points = point_state(robot, arm)
+    world = points.x + Vec(*base_point(robot))
+    rho = jnp.asarray(robot.points.radius, arm.p.dtype)
+    segment = np.array(robot.points.segment, int)
+    moves = np.arange(robot.n)[:, None] <= segment
+    spin, shift = (v.map(lambda c: c[:, None]) for v in (arm.S.ang, arm.S.lin))
+    J = (shift + spin.cross(points.x)).map(lambda c: jnp.where(moves, c, 0.0))
+    found = []
+    for kind in obstacles.kinds:
+        gap = kind.gap(world, points.v, rho)
+        normal = gap.normal.map(lambda c, d=gap.distance: jnp.broadcast_to(c, d.shape))
+        rows = normal.map(lambda c: c[:, None]) @ J
+        found.append(
+            Barriers(
+                gap.distance.ravel(),
+                gap.rate.ravel(),
+                (gap.curvature + normal @ points.a).ravel(),
+                rows.swapaxes(1, 2).reshape(-1, robot.n),
+                jnp.broadcast_to(gap.active, gap.distance.shape).ravel(),
+            )
+        )
+    return Barriers(*(jnp.concatenate(x) for x in zip(*found, strict=True)))
+
+
+def _links(robot: Robot, arm: ArmState) -> Barriers | None:
+    """Barriers between the links' capsules that can touch."""
+    if not robot.capsules.pairs:
+        return None
+    distance, rate, curvature, rows = self_gaps(robot, arm)
+    return Barriers(distance, rate, curvature, rows, jnp.ones_like(rate, bool))
+
+
+def _joints(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> Barriers:
+    """Barriers between every joint and its limits."""
+    room = jnp.concatenate([q - robot.q_lower, robot.q_upper - q])
+    limited = jnp.isfinite(room)
+    eye = jnp.eye(robot.n, dtype=room.dtype)
+    return Barriers(
+        jnp.where(limited, room, 0.0),
+        jnp.concatenate([qd, -qd]),
+        jnp.zeros_like(room),
+        jnp.concatenate([eye, -eye]),
+        limited,
+    )
+
+
+def _solver():
+    """The elastic solver of qpax.
+
+    Raises:
+        ImportError: The extra `cbf` is not installed.
+    """
+    try:
+        from qpax.explicit.elastic_qp import solve_qp_elastic
+    except ImportError as error:
+        raise ImportError(
+            "vices_cbf needs the extra `cbf`: pip install 'rmp-mjx[cbf]'"
+        ) from error
+    return solve_qp_elastic

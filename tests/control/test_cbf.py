@@ -1,0 +1,170 @@
+"""The safety filter against an exact solver, on an arm that compiles fast."""
+
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from rmp_mjx import VICES, Obstacles, Robot
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state
+from tests.control.conftest import QUICK
+from tests.robot.test_model import GRIPPER
+
+pytest.importorskip("qpax")
+clarabel = pytest.importorskip("clarabel")
+
+from scipy import sparse  # noqa: E402
+
+from rmp_mjx.control import cbf  # noqa: E402
+
+STATES = 64
+BALL = np.array([[0.35, 0.1, 0.45], [0.2, -0.2, 0.5]])
+
+
+@pytest.fixture(scope="module")
+def filtered():
+    return cbf.FilteredVICES(Robot.from_mjcf(GRIPPER, site="tip", spacing=0.1))
+
+
+@pytest.fixture(scope="module")
+def states():
+    rng = np.random.default_rng(0)
+    return (
+        rng.uniform(-1.0, 1.0, (STATES, 3)),
+        rng.normal(size=(STATES, 3)),
+        rng.uniform(-1.0, 1.0, (STATES, 12)),
+    )
+
+
+def slots():
+    plane = np.array([[0.0, 0.0, 1.0]])
+    empty = Obstacles.empty(spheres=3, planes=1)
+    return empty.with_spheres(BALL, 0.05).with_planes(0.0 * plane, plane)
+
+
+@pytest.fixture(scope="module")
+def run(filtered, states):
+    """Output, VICES' acceleration, barriers and dynamics in all states, float32."""
+
+    @jax.jit(compiler_options=QUICK)
+    def every(q, qd, action):
+        def one(q, qd, action):
+            setpoint = filtered.setpoint(q, filtered.decode(action))
+            arm = arm_state(filtered.robot, q, qd)
+            return (
+                filtered(q, qd, setpoint, slots()),
+                wanted(VICES(filtered.robot)(q, qd, setpoint, slots()), arm),
+                filtered.barriers(arm, q, qd, slots()),
+                dynamics(filtered.robot, arm),
+            )
+
+        def wanted(out, arm):
+            Mq, bias = dynamics(filtered.robot, arm)
+            return jax.numpy.linalg.solve(Mq, out.tau - bias)
+
+        return jax.vmap(one)(q, qd, action)
+
+    return jax.device_get(every(*(np.float32(x) for x in states)))
+
+
+def exact(ctrl, wanted, barriers, Mq, bias):
+    """The elastic program by Clarabel, in joint accelerations; None: not solved."""
+    n, on = len(wanted), barriers.active
+    alpha = ctrl.rate
+    need = barriers.drift + 2 * alpha * barriers.rate + alpha**2 * barriers.distance
+    tau_max = np.asarray(ctrl.robot.tau_max, float)
+    G = np.concatenate([-barriers.rows[on], Mq, -Mq]).astype(float)
+    h = np.concatenate([need[on], tau_max - bias, tau_max + bias]).astype(float)
+    length = np.linalg.norm(np.linalg.solve(np.linalg.cholesky(Mq), G.T), axis=0)
+    movable = length > cbf.FREE
+    G, h, length = G[movable], h[movable], length[movable]
+    most = cbf.LARGEST * cbf.UNIT * length
+    h = G @ wanted + np.clip(h - G @ wanted, -most, most)
+    m = len(h)
+    # Slack in the units of the scaled program: t >= 0, G x - length UNIT t <= h.
+    cost = sparse.block_diag([Mq.astype(float), sparse.csc_matrix((m, m))]).tocsc()
+    linear = np.concatenate(
+        [-Mq.astype(float) @ wanted, np.full(m, ctrl.penalty * cbf.UNIT**2)]
+    )
+    slack = sparse.diags(length * cbf.UNIT)
+    A = sparse.bmat([[sparse.csc_matrix(G), -slack], [None, -sparse.eye(m)]]).tocsc()
+    b = np.concatenate([h, np.zeros(m)])
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    cone = [clarabel.NonnegativeConeT(2 * m)]
+    solution = clarabel.DefaultSolver(
+        sparse.triu(cost).tocsc(), linear, A, b, cone, settings
+    ).solve()
+    return np.array(solution.x[:n]), np.array(solution.x[n:])
+
+
+def test_the_program_is_solved_as_by_clarabel(filtered, run):
+    """Within 1 % of `UNIT` in the inertia's norm in 95 % of the states, 10 % in all:
+    the solver stops at a residual of 1e-4, and float32 does not go much further."""
+    out, vices, barriers, (Mq, bias) = run
+    assert out.diagnostics["solved"].mean() > 0.95
+    errors, changed = [], 0
+    for k in np.flatnonzero(out.diagnostics["solved"]):
+        one = cbf.Barriers(*(x[k] for x in barriers))
+        qdd, _ = exact(filtered, vices[k].astype(float), one, Mq[k], bias[k])
+        gap = out.qdd[k] - qdd
+        errors.append(np.sqrt(gap @ Mq[k] @ gap) / cbf.UNIT)
+        changed += np.abs(qdd - vices[k]).max() > 1.0
+    assert changed > 10
+    assert np.quantile(errors, 0.95) < 0.01 and max(errors) < 0.1
+
+
+def test_barriers_are_distances_and_their_time_derivatives(filtered, states):
+    """Against differences along q + t qd: the rate and, with qdd = 0, the drift.
+
+    1e-5 relative to the largest: second differences of float64 at a step of 1e-4.
+    """
+    step = 1e-4
+
+    @jax.jit(compiler_options=QUICK)
+    def at(q, qd):
+        def one(q, qd):
+            arm = arm_state(filtered.robot, q, qd)
+            return filtered.barriers(arm, q, qd, slots())
+
+        return jax.vmap(one)(q, qd)
+
+    with jax.enable_x64(True):
+        q, qd, _ = states
+        moved = [at(q + t * qd, qd) for t in (-step, 0.0, step)]
+        off = [at(q + step * np.eye(3)[j], qd).distance for j in range(3)]
+        (before, now, after), off = jax.device_get((moved, off))
+    on = now.active[0]
+    assert on.sum() > 40
+    rate = (after.distance - before.distance) / (2 * step)
+    np.testing.assert_allclose(
+        now.rate[:, on], rate[:, on], atol=1e-5 * np.abs(rate).max()
+    )
+    drift = (after.rate - before.rate) / (2 * step)
+    np.testing.assert_allclose(
+        now.drift[:, on], drift[:, on], atol=1e-4 * np.abs(drift).max()
+    )
+    slope = np.stack([(x - now.distance) / step for x in off], axis=-1)
+    np.testing.assert_allclose(now.rows[:, on], slope[:, on], atol=1e-2)
+
+
+def test_where_nothing_is_near_it_is_vices(filtered, run):
+    """Wherever VICES' own acceleration keeps every barrier; 1 % of `UNIT`: the
+    solver's tolerance."""
+    out, vices, barriers, (Mq, _) = run
+    need = barriers.drift + 2 * filtered.rate * barriers.rate
+    need = need + filtered.rate**2 * barriers.distance
+    room = need + np.einsum("bmn,bn->bm", barriers.rows, vices)
+    free = (room > 0.0).all(1, where=barriers.active)
+    assert free.sum() > 2
+    gap = (out.qdd - vices)[free]
+    error = np.sqrt(np.einsum("bi,bij,bj->b", gap, Mq[free], gap)) / cbf.UNIT
+    assert error.max() < 0.01
+
+
+def test_it_says_what_to_install_without_its_solver(filtered, monkeypatch):
+    monkeypatch.setitem(sys.modules, "qpax.explicit.elastic_qp", None)
+    with pytest.raises(ImportError, match=r"rmp-mjx\[cbf\]"):
+        cbf.FilteredVICES(filtered.robot)
