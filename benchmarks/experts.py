@@ -20,12 +20,14 @@ import envs
 from benchmarks.common import Row, show, write_json
 from envs import door
 from envs.base import ArmEnv
-from envs.options import CONTROLLERS
 from envs.types import State
 from rmp_mjx import runtime
 from rmp_mjx.math import orientation_error
 
 EVENTS = ("collision", "self_collision", "joint_limit")
+
+DEFAULT = ("rmp_vices", "vices", "rmp_vices_literal")
+"""Controllers that are compared unless others are asked for."""
 
 
 class Memory(NamedTuple):
@@ -208,7 +210,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tasks", nargs="+", default=[c.task for c in CASES])
-    parser.add_argument("--controllers", nargs="+", default=list(CONTROLLERS))
+    parser.add_argument("--controllers", nargs="+", default=DEFAULT)
     parser.add_argument("--json", type=Path, help="benchmarks/results/experts.json")
     options = parser.parse_args(args)
     runtime.configure()

@@ -61,15 +61,15 @@ SCENES = (
 class Parameters:
     """What is tuned; the defaults are the leaves' own (a test holds them together)."""
 
-    mu: float = 1e-4
+    mu: float = 5e-5
     """Collision: metric scale."""
-    eps: float = 0.3
+    eps: float = 0.05
     """Collision: velocity floor."""
-    eta: float = 30.0
+    eta: float = 20.0
     """Collision: damping [1/s]."""
     r: float = 0.2
     """Collision: range [m]."""
-    margin: float = 0.007
+    margin: float = 0.005
     """Collision: margin [m]."""
     limit_mu: float = 3.5e-3
     """Joint limits: metric scale."""
@@ -77,17 +77,17 @@ class Parameters:
     """Joint limits: margin [rad]."""
     limit_r: float = 0.25
     """Joint limits: range [rad]."""
-    kq: float = 1.2
+    kq: float = 2.5
     """Posture: stiffness [1/s^2]."""
-    posture: float = 5e-3
+    posture: float = 0.02
     """Posture: weight."""
-    least: float = 2e-3
+    least: float = 0.01
     """Yielding: weight of the orientation at an obstacle."""
-    far: float = 0.06
+    far: float = 0.08
     """Yielding: clearance at which it begins [m]."""
-    limit_least: float = 2.5e-3
+    limit_least: float = 0.01
     """Yielding near joint limits: weight of the orientation at a limit."""
-    limit_far: float = 1.9
+    limit_far: float = 1.2
     """Yielding near joint limits: distance at which it begins [rad]."""
 
     @staticmethod

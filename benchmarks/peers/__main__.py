@@ -220,7 +220,7 @@ def main(argv: list[str] | None = None) -> None:
             mine = [c for c in COMPARISONS if c.peer == peer.name]
             rows += compare(mine, ours, theirs, rounds, seconds)
             if peer.name == "rmp2":
-                note = "99th percentile, of the largest acceleration of a state"
+                note = "largest, over the largest acceleration of its state, in float64"
                 value = theirs.measure("disagreement", 0.0)
                 rows.append(Row("rmp2_disagreement", value, "", note))
         except (venv.NotInstalled, ContestantError) as error:

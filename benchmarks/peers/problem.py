@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import rmp_mjx as rmp
@@ -24,13 +25,13 @@ def controller(robot: rmp.Robot) -> rmp.RMPVICES:
 def arrays(seed: int) -> dict[str, Any]:
     """The arm, its control points, the leaves, a batch of states, our answer.
 
-    Float32, SI units; states have a leading batch axis. ``regularizer`` is the inertia
+    Float64, SI units; states have a leading batch axis. ``regularizer`` is the inertia
     matrix, metric of posture and regulariser; ``posture`` is (stiffness, damping,
     weight, weight of the regulariser); ``qdd`` the accelerations of `controller`.
     """
     robot = rmp.Robot.load("jaco2")
     ctrl: Any = controller(robot)
-    q, qd, action, obstacles = random_states(robot, BATCH, seed)
+    q, qd, action, obstacles = jax.tree.map(double, random_states(robot, BATCH, seed))
     setpoint = jax.jit(jax.vmap(ctrl.setpoint))(q, action)
 
     @jax.jit
@@ -69,7 +70,7 @@ def arrays(seed: int) -> dict[str, Any]:
         "kp_pos": setpoint.kp_pos,
         "kp_ori": setpoint.kp_ori,
     }
-    found = {name: np.asarray(value, np.float32) for name, value in found.items()}
+    found = {name: np.asarray(value, float) for name, value in found.items()}
     segment = np.array(points.segment)
     if (np.diff(segment) < 0).any() or segment[0] < 0:
         raise ValueError("the control points must be in the order of their links")
@@ -78,4 +79,11 @@ def arrays(seed: int) -> dict[str, Any]:
 
 def write(path: Path, seed: int) -> None:
     """Write `arrays` to a file."""
-    np.savez(path, **arrays(seed))
+    with jax.enable_x64(True):
+        np.savez(path, **arrays(seed))
+
+
+def double(x) -> jax.Array:
+    """An array in float64 if it is one of numbers that are not whole."""
+    x = np.asarray(x)
+    return jnp.asarray(x, jnp.float64 if x.dtype.kind == "f" else x.dtype)

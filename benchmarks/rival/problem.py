@@ -13,7 +13,7 @@ import numpy as np
 import envs
 import rmp_mjx as rmp
 from benchmarks.bench_controller import BATCH, random_states
-from benchmarks.peers.problem import BARRIER
+from benchmarks.peers.problem import BARRIER, double
 from envs.scene import ARM, TABLE_HEIGHT
 
 SCENE, ARRAYS = "scene.mjb", "arrays.npz"
@@ -57,13 +57,13 @@ def states(env: envs.ArmEnv, seed: int) -> dict[str, Any]:
     robot = env.robot
     single = random_states(robot, BATCH, seed)
     with jax.enable_x64(True):
-        q, qd, action, obstacles = jax.tree.map(_double, single)
+        q, qd, action, obstacles = jax.tree.map(double, single)
         spheres = obstacles.spheres
         obstacles = rmp.Obstacles.empty(spheres=len(spheres.radius), planes=1)
         obstacles = obstacles.with_spheres(spheres.center, spheres.radius).with_planes(
             [[0.0, 0.0, TABLE_HEIGHT]], [[0.0, 0.0, 1.0]]
         )
-        obstacles = jax.tree.map(_double, obstacles)
+        obstacles = jax.tree.map(double, obstacles)
         setpoint = jax.jit(jax.vmap(env.controller.setpoint))(q, action)
         torques = {}
         for name, ctrl in (("rmp_vices", env.controller), ("vices", rmp.VICES(robot))):
@@ -96,8 +96,3 @@ def _barrier(leaf) -> np.ndarray:
 
 def _yielding(leaf) -> np.ndarray:
     return np.array([leaf.least, leaf.near, leaf.far], float)
-
-
-def _double(x):
-    x = np.asarray(x)
-    return jnp.asarray(x, jnp.float64 if x.dtype.kind == "f" else x.dtype)

@@ -94,7 +94,7 @@ class RMPVICES:
             "collision": collision_near,
             "self_collision": collision_near,
             "joint_limit": lambda: JointLimitBarrier(robot.q_lower, robot.q_upper),
-            "posture": lambda: Posture(robot.q_home, kq=1.2, kd=10.0, weight=5e-3),
+            "posture": lambda: Posture(q_0=robot.q_home, kq=2.5, kd=10.0),
             "yielding": Yielding,
             "limit_yielding": limit_yielding,
         }

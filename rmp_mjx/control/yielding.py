@@ -22,11 +22,11 @@ class Yielding:
     A state-dependent edge weight of the tree, as in RMPfusion (Li et al., 2019).
     """
 
-    least: Float[Array, ""] | float = 2e-3
+    least: Float[Array, ""] | float = 0.01
     """Weight where there is no room, [m^2/rad^2], > 0; 1: the orientation holds."""
     near: Float[Array, ""] | float = 0.02
     """Room up to which the weight is ``least``, [m] or [rad]."""
-    far: Float[Array, ""] | float = 0.06
+    far: Float[Array, ""] | float = 0.08
     """Room from which on the weight is 1, [m] or [rad]."""
 
     def __call__(self, room: Float[Array, ""]) -> Float[Array, ""]:
@@ -38,4 +38,4 @@ class Yielding:
 
 def limit_yielding() -> Yielding:
     """Yielding near a joint's limit; room in rad."""
-    return Yielding(least=2.5e-3, near=0.2, far=1.9)
+    return Yielding(least=0.01, near=0.2, far=1.2)

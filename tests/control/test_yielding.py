@@ -30,8 +30,8 @@ def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obs
         weights.append(out.diagnostics["orientation_weight"])
         clearance = out.diagnostics["clearance"]
         if planes is low:  # then the nearest obstacle is a body
-            share = np.clip((0.06 - clearance) / 0.04, 0.0, 1.0)
-            np.testing.assert_allclose(weights[-1], 2e-3**share, rtol=1e-9)
+            share = np.clip((0.08 - clearance) / 0.06, 0.0, 1.0)
+            np.testing.assert_allclose(weights[-1], 0.01**share, rtol=1e-9)
     np.testing.assert_array_equal(*weights)
     assert np.mean(weights[0] == 1.0) > 0.05
     assert np.mean(weights[0] < 0.5) > 0.05
@@ -48,6 +48,6 @@ def test_orientation_yields_to_the_nearest_joint_limit(run64, ctrl, states, obst
     assert np.isinf(lower).any()
     room = np.minimum(q - lower, upper - q).min(1)
     share = np.clip((1.0 - room) / 0.8, 0.0, 1.0)
-    np.testing.assert_allclose(weight, 2.5e-3**share, rtol=1e-9)
+    np.testing.assert_allclose(weight, 0.01**share, rtol=1e-9)
     assert np.mean(weight == 1.0) > 0.05
     assert np.mean(weight < 0.5) > 0.05

@@ -17,7 +17,7 @@ def test_an_unknown_task_lists_the_tasks_and_suggests_one():
     ("options", "message"),
     [
         ({"obstacle": 2}, "'obstacle'.*obstacles.*Did you mean 'obstacles'"),
-        ({"controller": "osc"}, "'osc'.*rmp_vices, vices"),
+        ({"controller": "pid"}, "'pid'.*rmp_vices, vices"),
         ({"physics": "bullet"}, "'bullet'.*auto, mujoco, mjx"),
         ({"layout": "near"}, "'near'.*far, close"),
         ({"observation": "image"}, "'image'.*rotated, fixed"),
