@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import functools
+from collections.abc import Iterable
 from typing import ClassVar
 
 import jax
@@ -287,12 +288,13 @@ class ArmEnv(abc.ABC):
             self.robot, arm_state(self.robot, data.qpos[:n], data.qvel[:n])
         )
 
-    def gaps(self, data: PhysicsState, spheres: Spheres) -> list[Gap]:
+    def gaps(self, data: PhysicsState, spheres: Spheres) -> Iterable[Gap]:
         """Distances of all control points to what the tree avoids, kind by kind."""
         x = Vec.of(self._arm_points(data.qpos[: self.robot.n]), 1)
         rest = x.map(jnp.zeros_like)
-        rho = jnp.asarray(self.robot.points.radius, data.qpos.dtype)
-        return [k.gap(x, rest, rho) for k in self.obstacles(data, spheres).kinds]
+        points = self.robot.points
+        rho = jnp.asarray(points.radius, data.qpos.dtype)
+        return self.obstacles(data, spheres).gaps(x, rest, rho, points.hand).values()
 
     def clearance(self, data: PhysicsState, spheres: Spheres) -> Float[Array, ""]:
         """Least distance of a control point to what the tree avoids [m]."""

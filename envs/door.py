@@ -81,7 +81,7 @@ class Door(ArmEnv):
     q_start = np.array([3.363, 4.028, 0.013, 1.847, -0.012, 4.102, 3.178])
     sphere_box = (np.array([0.20, -0.40, 0.0]), np.array([0.60, 0.40, 0.35]))
     task_metrics: ClassVar[dict[str, str]] = {"door_angle": "max"}
-    fixture_slots: ClassVar[dict[str, int]] = {"boxes": 1}
+    fixture_slots: ClassVar[dict[str, int]] = {"boxes": 2}
     hold = 10
     """Policy steps at rest near the goal that solve the task."""
 
@@ -91,7 +91,9 @@ class Door(ArmEnv):
         model = self.scene.model
         self.hinge = model.body("door/door").pos
         panel = model.geom("door/panel")
-        self.panel_offset, self.panel_size = panel.pos, panel.size
+        center, size = _around([model.geom(name) for name in HANDLE])
+        self.plates = np.stack([panel.pos, center])
+        self.plate_sizes = np.stack([panel.size, size])
         self.grasp_offset = model.site("door/grasp").pos
         self.sweep = self._sweep()
 
@@ -107,15 +109,16 @@ class Door(ArmEnv):
         return Contacts(fixtures=("door/panel",), work=HANDLE)
 
     def fixtures(self, slots: Obstacles, data: PhysicsState) -> Obstacles:
-        """The panel: a bounded plate that turns with its hinge."""
+        """Panel and handle: bounded plates that turn with their hinge."""
         R, spin = self._turn(data)
-        arm = R @ self.panel_offset
+        arms = self.plates @ R.T
         return slots.with_boxes(
-            (self.hinge + arm)[None],
-            self.panel_size[None],
-            R[None],
-            velocities=jnp.cross(spin, arm)[None],
-            angular_velocities=spin[None],
+            self.hinge + arms,
+            self.plate_sizes,
+            jnp.stack([R, R]),
+            velocities=jnp.cross(spin, arms),
+            angular_velocities=jnp.stack([spin, spin]),
+            worked=np.array([False, True]),
         )
 
     def _sweep(self) -> np.ndarray:
@@ -123,7 +126,7 @@ class Door(ArmEnv):
 
         A sphere of 5 cm that keeps its centre 8 cm from them blocks neither.
         """
-        (x, y, z), (_, half, height) = self.panel_offset, self.panel_size
+        (x, y, z), (_, half, height) = self.plates[0], self.plate_sizes[0]
         panel = [
             (x, -r, h)
             for r in np.linspace(0.08, half - y, 9)
@@ -204,6 +207,14 @@ class Door(ArmEnv):
             "handle": self.grasp_at(data.qpos[n]) - site.p,
             "contact": (task["grip_force"] > 0.0).astype(jnp.float32),
         }
+
+
+def _around(capsules: list) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and half sizes of the box around capsules of one body, in its frame [m]."""
+    half = [c.size[1] * np.abs(quat_to_mat(c.quat)[:, 2]) + c.size[0] for c in capsules]
+    low = np.min([c.pos - h for c, h in zip(capsules, half, strict=True)], axis=0)
+    high = np.max([c.pos + h for c, h in zip(capsules, half, strict=True)], axis=0)
+    return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _opened(angle: Array | float) -> Array:

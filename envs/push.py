@@ -17,6 +17,8 @@ from envs.placement import CANDIDATES
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
 from envs.types import Entry, Score
+from rmp_mjx.math import quat_to_mat
+from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
 
@@ -79,6 +81,7 @@ class Push(ArmEnv):
     q_start = np.array([3.152, 3.878, -0.009, 1.317, 0.065, 3.708, 3.147])
     sphere_box = (np.array([0.32, -0.28, -0.05]), np.array([0.60, 0.28, 0.20]))
     task_metrics: ClassVar[dict[str, str]] = {"goal_distance": "last"}
+    fixture_slots: ClassVar[dict[str, int]] = {"boxes": 1}
     hand_reward, goal_reward = 5.0, 50.0
     slope = 20.0
     """Slope of the rewards ``1 - tanh(slope d)`` [1/m]."""
@@ -108,6 +111,19 @@ class Push(ArmEnv):
             work=("push/block",),
             work_friction=asked.block_friction,
             passive=(("push/block", "table", asked.block_friction),),
+        )
+
+    def fixtures(self, slots: Obstacles, data: PhysicsState) -> Obstacles:
+        """The block, which the hand alone may touch."""
+        n = self.robot.n
+        R = quat_to_mat(data.qpos[n + 3 : n + 7])
+        return slots.with_boxes(
+            self.block(data)[None],
+            np.full((1, 3), HALF_SIZE),
+            R[None],
+            velocities=data.qvel[None, n : n + 3],
+            angular_velocities=(R @ data.qvel[n + 3 : n + 6])[None],
+            worked=True,
         )
 
     def begin(

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from rmp_mjx.vec import Vec
 
@@ -41,7 +41,7 @@ class Gap(NamedTuple):
     curvature: Array
     """The part of the distance's acceleration that is not normal . xdd [m/s^2]."""
     active: Array
-    """Whether the slot is in use, (o, 1)."""
+    """Whether the control point has to keep off, (o, p)."""
 
 
 @struct.dataclass
@@ -54,14 +54,16 @@ class Spheres:
     """Radius [m]."""
     velocity: Float[Array, "o 3"]
     """Velocity of the centre [m/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
     active: Bool[Array, " o"]
     """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
-        """Distances to control points x (p,) with velocities v and radii rho."""
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`."""
         g = x - Vec.column(self.center)
         gdot = v - Vec.column(self.velocity)
-        return _inflate(g, gdot, self.radius[:, None] + rho, self.active)
+        return _inflate(g, gdot, self.radius[:, None] + rho, _avoided(self, hand))
 
 
 @struct.dataclass
@@ -74,15 +76,17 @@ class Planes:
     """Unit normal that points out of the obstacle."""
     velocity: Float[Array, "o 3"]
     """Velocity of the surface [m/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
     active: Bool[Array, " o"]
     """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
-        """Distances to control points x (p,) with velocities v and radii rho."""
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`."""
         n = Vec.column(self.normal)
         distance = n @ (x - Vec.column(self.point)) - rho
         rate = n @ (v - Vec.column(self.velocity))
-        return Gap(distance, rate, n, jnp.zeros_like(rate), self.active[:, None])
+        return Gap(distance, rate, n, jnp.zeros_like(rate), _avoided(self, hand))
 
 
 @struct.dataclass
@@ -101,11 +105,13 @@ class Capsules:
     """Velocity of the centre [m/s]."""
     angular_velocity: Float[Array, "o 3"]
     """Angular velocity, world frame [rad/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
     active: Bool[Array, " o"]
     """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
-        """Distances to control points x (p,) with velocities v and radii rho."""
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`."""
         axis, half = Vec.column(self.axis), self.half_length[:, None]
         r, rel, coriolis = _ride_along(self, x, v)
         along = axis @ r
@@ -113,7 +119,7 @@ class Capsules:
         g = r - axis * jnp.clip(along, -half, half)
         gdot = rel - axis * jnp.where(free, 0.0, axis @ rel)
         radius = self.radius[:, None] + rho
-        return _inflate(g, gdot, radius, self.active, coriolis)
+        return _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
 
 
 @struct.dataclass
@@ -132,11 +138,13 @@ class Boxes:
     """Velocity of the centre [m/s]."""
     angular_velocity: Float[Array, "o 3"]
     """Angular velocity, world frame [rad/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
     active: Bool[Array, " o"]
     """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array) -> Gap:
-        """Distances to control points x (p,) with velocities v and radii rho.
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`.
 
         Inside the core the distance is minus the depth below the nearest face.
         """
@@ -160,7 +168,7 @@ class Boxes:
             axes[0] * w.x + axes[1] * w.y + axes[2] * w.z for w in (local_g, local_gdot)
         )
         radius = self.radius[:, None] + rho
-        gap = _inflate(g, gdot, radius, self.active, coriolis)
+        gap = _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
         return gap._replace(distance=jnp.where(inside, depth - radius, gap.distance))
 
 
@@ -179,7 +187,12 @@ def _inflate(
     if coriolis is not None:
         curvature = curvature + normal @ coriolis
     distance = jnp.where(touching, 0.0, norm) - radius
-    return Gap(distance, rate, normal, curvature, active[:, None])
+    return Gap(distance, rate, normal, curvature, active)
+
+
+def _avoided(kind: Spheres | Planes | Capsules | Boxes, hand: np.ndarray) -> Array:
+    """Which control points keep off which obstacles, (o, p)."""
+    return kind.active[:, None] & ~(kind.worked[:, None] & hand)
 
 
 def _ride_along(body: Capsules | Boxes, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
@@ -190,6 +203,10 @@ def _ride_along(body: Capsules | Boxes, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
     swept = omega.cross(r)
     coriolis = omega.cross(swept) - omega.cross(rdot) * 2.0
     return r, rdot - swept, coriolis
+
+
+KINDS = {Spheres: "spheres", Planes: "planes", Capsules: "capsules", Boxes: "boxes"}
+"""Kinds of obstacles by name."""
 
 
 @struct.dataclass
@@ -217,7 +234,8 @@ class Obstacles:
         up = jnp.array([0.0, 0.0, 1.0])
 
         def common(n: int) -> dict[str, Array]:
-            return {"velocity": jnp.zeros((n, 3)), "active": jnp.zeros(n, bool)}
+            off = jnp.zeros(n, bool)
+            return {"velocity": jnp.zeros((n, 3)), "worked": off, "active": off}
 
         def turning(n: int) -> dict[str, Array]:
             spin = {"angular_velocity": jnp.zeros((n, 3))}
@@ -254,13 +272,27 @@ class Obstacles:
         every = (self.spheres, self.planes, self.capsules, self.boxes)
         return tuple(kind for kind in every if kind.active.shape[-1])
 
-    def with_spheres(self, centers, radii, velocities=None) -> Obstacles:
+    def gaps(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> dict[str, Gap]:
+        """Distances of control points to the obstacles, by kind with any slots.
+
+        Args:
+            x: Positions, world frame, (p,) each [m].
+            v: Velocities, (p,) each [m/s].
+            rho: Radii, (p,) [m].
+            hand: Which of them are the hand's, (p,) bool.
+        """
+        return {KINDS[type(kind)]: kind.gap(x, v, rho, hand) for kind in self.kinds}
+
+    def with_spheres(
+        self, centers, radii, velocities=None, worked: ArrayLike = False
+    ) -> Obstacles:
         """Use the first k sphere slots.
 
         Args:
             centers: (k, 3), world frame [m].
             radii: (k,) or one number [m].
             velocities: (k, 3) [m/s]; default at rest.
+            worked: (k,) or one bool: whether the hand works on them.
 
         Raises:
             ValueError: More than the slots there are, or a radius that is not positive.
@@ -268,20 +300,38 @@ class Obstacles:
         _check_positive("sphere radii", radii)
         return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
             spheres=_fill(
-                self.spheres, center=centers, radius=radii, velocity=velocities
+                self.spheres,
+                center=centers,
+                radius=radii,
+                velocity=velocities,
+                worked=worked,
             )
         )
 
-    def with_planes(self, points, normals, velocities=None) -> Obstacles:
+    def with_planes(
+        self, points, normals, velocities=None, worked: ArrayLike = False
+    ) -> Obstacles:
         """Use the first k plane slots: a point (k, 3) on each and its normal (k, 3)."""
         normals = jnp.asarray(normals, float)
         unit = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
         return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            planes=_fill(self.planes, point=points, normal=unit, velocity=velocities)
+            planes=_fill(
+                self.planes,
+                point=points,
+                normal=unit,
+                velocity=velocities,
+                worked=worked,
+            )
         )
 
     def with_capsules(
-        self, starts, ends, radii, velocities=None, angular_velocities=None
+        self,
+        starts,
+        ends,
+        radii,
+        velocities=None,
+        angular_velocities=None,
+        worked: ArrayLike = False,
     ) -> Obstacles:
         """Use the first k capsule slots: segments (k, 3) to (k, 3) [m] and radii."""
         _check_positive("capsule radii", radii)
@@ -298,6 +348,7 @@ class Obstacles:
                 radius=radii,
                 velocity=velocities,
                 angular_velocity=angular_velocities,
+                worked=worked,
             )
         )
 
@@ -309,6 +360,7 @@ class Obstacles:
         radii=0.0,
         velocities=None,
         angular_velocities=None,
+        worked: ArrayLike = False,
     ) -> Obstacles:
         """Use the first k box slots.
 
@@ -319,6 +371,7 @@ class Obstacles:
             radii: Rounding added to the core, (k,) or one number [m].
             velocities: Of the centres, (k, 3) [m/s]; default at rest.
             angular_velocities: World frame, (k, 3) [rad/s]; default none.
+            worked: (k,) or one bool: whether the hand works on them.
 
         Raises:
             ValueError: More than the slots there are, or a half size not positive.
@@ -335,6 +388,7 @@ class Obstacles:
                 radius=radii,
                 velocity=velocities,
                 angular_velocity=angular_velocities,
+                worked=worked,
             )
         )
 

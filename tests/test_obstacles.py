@@ -61,7 +61,8 @@ def points():
 @jax.jit
 def _gaps(slots, x, v):
     rho = jnp.full(x.shape[0], RHO)
-    return tuple(kind.gap(Vec.of(x), Vec.of(v), rho) for kind in slots.kinds)
+    hand = np.arange(x.shape[0]) % 2 == 0
+    return tuple(slots.gaps(Vec.of(x), Vec.of(v), rho, hand).values())
 
 
 @pytest.fixture(scope="module")
@@ -177,8 +178,10 @@ def test_rate_normal_and_curvature_are_derivatives_of_the_distance(
 
     def distance(x, t):
         rho = jnp.full(x.shape[0], RHO)
-        (gap,) = (k.gap(Vec.of(x), Vec.of(v), rho) for k in _moved(args, kind, t).kinds)
-        return gap.distance
+        hand = np.zeros(x.shape[0], bool)
+        return (
+            _moved(args, kind, t).gaps(Vec.of(x), Vec.of(v), rho, hand)[kind].distance
+        )
 
     def rate(t):
         return jax.jvp(lambda t: distance(x + t * v, t), (t,), (1.0,))[1]
@@ -213,8 +216,24 @@ def test_unused_slots_are_inactive_and_finite(points):
         x, v = (p.astype(np.float32) for p in points)
         for kind, gap in zip(KINDS, _gaps(slots, x, v), strict=True):
             used = fill and kind in ("spheres", "planes")
-            assert gap.active.ravel().tolist() == [used, False, False]
+            assert gap.active.all(axis=1).tolist() == [used, False, False]
+            assert gap.active.any(axis=1).tolist() == [used, False, False]
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gap))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_hand_may_touch_what_it_works_on_and_the_other_links_may_not(
+    kind, scene, points
+):
+    """Points with even numbers are the hand's; the first obstacle alone is worked."""
+    worked = np.arange(6) == 0
+    with jax.enable_x64(True):
+        slots = getattr(scene[0], f"with_{kind}")(*scene[1][kind], worked=worked)
+        gap = dict(zip(KINDS, _gaps(slots, *points), strict=True))[kind]
+    active = np.asarray(gap.active)
+    assert active[1:].all()
+    assert active[0, 1::2].all()
+    assert not active[0, ::2].any()
 
 
 def test_at_the_core_everything_is_finite_with_a_unit_normal():

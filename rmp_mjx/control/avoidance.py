@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.obstacles import Boxes, Capsules, Gap, Obstacles, Planes, Spheres
+from rmp_mjx.obstacles import Gap, Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf
 from rmp_mjx.robot.kinematics import (
     ArmState,
@@ -22,16 +22,13 @@ from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
 from rmp_mjx.vec import Vec, store, sum_all
 
-KINDS = {Spheres: "spheres", Planes: "planes", Capsules: "capsules", Boxes: "boxes"}
-"""Kinds of obstacles by name."""
-
 CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]
-"""A leaf for all obstacles, or one for each kind of `KINDS` (None: not avoided)."""
+"""A leaf for all obstacles, or one for each kind by name (None: not avoided)."""
 
 
-def leaf_of(leaf: CollisionLeaf, kind: object) -> ScalarLeaf | None:
+def leaf_of(leaf: CollisionLeaf, kind: str) -> ScalarLeaf | None:
     """The leaf that avoids obstacles of this kind."""
-    return leaf[KINDS[type(kind)]] if isinstance(leaf, Mapping) else leaf
+    return leaf[kind] if isinstance(leaf, Mapping) else leaf
 
 
 def per_link(robot: Robot, values: Float[ArrayLike, " n"]) -> Float[Array, " p"]:
@@ -56,9 +53,9 @@ def obstacle_branch(
     world = points.x + Vec(origin[0], origin[1], origin[2])
     rho = jnp.asarray(robot.points.radius, arm.p.dtype)
     total, clearance = None, {}
-    for kind in obstacles.kinds:
-        gap = kind.gap(world, points.v, rho)
-        clearance[KINDS[type(kind)]] = jnp.min(
+    gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
+    for kind, gap in gaps.items():
+        clearance[kind] = jnp.min(
             jnp.where(gap.active, gap.distance, jnp.inf), initial=jnp.inf
         )
         own = leaf_of(leaf, kind)

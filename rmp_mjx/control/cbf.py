@@ -188,8 +188,8 @@ def _points(robot: Robot, arm: ArmState, obstacles: Obstacles) -> Barriers | Non
     spin, shift = (v.map(lambda c: c[:, None]) for v in (arm.S.ang, arm.S.lin))
     J = (shift + spin.cross(points.x)).map(lambda c: jnp.where(moves, c, 0.0))
     found = []
-    for kind in obstacles.kinds:
-        gap = kind.gap(world, points.v, rho)
+    gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
+    for gap in gaps.values():
         normal = gap.normal.map(lambda c, d=gap.distance: jnp.broadcast_to(c, d.shape))
         rows = normal.map(lambda c: c[:, None]) @ J
         found.append(
@@ -198,7 +198,7 @@ def _points(robot: Robot, arm: ArmState, obstacles: Obstacles) -> Barriers | Non
                 gap.rate.ravel(),
                 (gap.curvature + normal @ points.a).ravel(),
                 rows.swapaxes(1, 2).reshape(-1, robot.n),
-                jnp.broadcast_to(gap.active, gap.distance.shape).ravel(),
+                gap.active.ravel(),
             )
         )
     return Barriers(*(jnp.concatenate(x) for x in zip(*found, strict=True)))

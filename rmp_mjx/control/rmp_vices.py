@@ -13,11 +13,11 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.control.action import ActionRange, compose_setpoint
-from rmp_mjx.control.avoidance import KINDS, obstacle_branch, self_branch
+from rmp_mjx.control.avoidance import obstacle_branch, self_branch
 from rmp_mjx.control.torque import scale_torque
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.control.yielding import Yielding, limit_yielding
-from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.obstacles import KINDS, Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.rmp.leaves.collision import collision_near

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from rmp_mjx.control.avoidance import CollisionLeaf, leaf_of
 from rmp_mjx.math import exp_so3, safe_norm
-from rmp_mjx.obstacles import Boxes, Capsules, Obstacles, Planes, Spheres
+from rmp_mjx.obstacles import KINDS, Boxes, Capsules, Obstacles, Planes, Spheres
 from rmp_mjx.rmp import RMP, Leaf, Node, ScalarLeaf, Siblings, TaskMap, identity_map
 from rmp_mjx.rmp.leaves.attractor import OrientationAttractor, PositionAttractor
 from rmp_mjx.rmp.leaves.posture import Posture
@@ -109,14 +109,15 @@ def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: CollisionLeaf) -> Sib
     def node(k):
         siblings = []
         for kind in obstacles.kinds:
-            own = leaf_of(leaf, kind)
+            own = leaf_of(leaf, KINDS[type(kind)])
             if own is None:
                 continue
             slots = kind.active.shape[0]
             params, rates = _moving(kind)
             params["rho"] = jnp.full(slots, points.radius[k])
             rates["rho"] = jnp.zeros(slots)
-            active = jnp.asarray(kind.active, jnp.result_type(float))[:, None]
+            active = kind.active & ~(kind.worked & bool(points.hand[k]))
+            active = jnp.asarray(active, jnp.result_type(float))[:, None]
             masked = Masked(_at_point(own, (slots, len(one_hot)), k), active)
             distance = TaskMap(DISTANCE[type(kind)], params, rates)
             siblings.append(Siblings(Node(distance, (masked,))))
@@ -134,7 +135,8 @@ def _at_point(leaf: ScalarLeaf, shape: tuple[int, int], k: int) -> ScalarLeaf:
 
 def _moving(kind: Any) -> tuple[dict[str, Array], dict[str, Array]]:
     """Parameters of an obstacle's distance map and their rates."""
-    fields = {f: getattr(kind, f) for f in kind.__dataclass_fields__ if f != "active"}
+    fields = {f: getattr(kind, f) for f in kind.__dataclass_fields__}
+    del fields["active"], fields["worked"]
     velocity = fields.pop("velocity")
     spin = fields.pop("angular_velocity", None)
     rates = jax.tree.map(jnp.zeros_like, fields)

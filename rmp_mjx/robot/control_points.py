@@ -43,6 +43,12 @@ class ControlPoints:
     body: tuple[str, ...] = struct.field(pytree_node=False)
     """Name of the MJCF body that carries it."""
 
+    @property
+    def hand(self) -> np.ndarray:
+        """Which of them the last joint moves, (p,) bool."""
+        segment = np.array(self.segment, int)
+        return segment == segment.max(initial=0)
+
 
 def body_capsules(model, data, segment, frames_p, frames_R, carriers):
     """Enclose every colliding geom of the carrier bodies in a capsule.

@@ -77,7 +77,8 @@ def states(robot):
 def obstacles():
     """`obstacles(seed)`: every kind, moving and turning, placed about the arm.
 
-    Other obstacles for each of the BATCH states; one sphere slot stays unused.
+    Other obstacles for each of the BATCH states; one sphere slot stays unused, and one
+    sphere is there for the hand to work on.
     """
 
     def draw(seed=0, scale=0.4, speed=1.0):
@@ -90,7 +91,9 @@ def obstacles():
             slots = Obstacles.empty(spheres=3, planes=1, capsules=1, boxes=1)
             up = np.array([[0.0, 0.0, 1.0]])
             return (
-                slots.with_spheres(sphere, np.array([0.05, 0.1]), sphere_v)
+                slots.with_spheres(
+                    sphere, np.array([0.05, 0.1]), sphere_v, np.array([False, True])
+                )
                 .with_planes(-0.1 * up, up, floor_v)
                 .with_capsules(ends[:1], ends[1:], 0.05, *capsule_v)
                 .with_boxes(box, [[0.1, 0.2, 0.05]], None, 0.02, *box_v)

@@ -81,6 +81,27 @@ def test_the_tree_sees_the_panel_of_the_physics(env, scene, starts, angle, rate)
     np.testing.assert_allclose(env.grasp_at(jnp.float32(angle)), handle, atol=1e-6)
 
 
+def test_the_tree_keeps_the_links_but_not_the_hand_off_the_handle(env, scene, starts):
+    """The box in the tree encloses the bars of the physics; 1e-6 m for float32."""
+    model, d = scene
+    data = opened(starts, 0.4)
+    d.qpos[:], d.qvel[:] = data.qpos, data.qvel
+    mujoco.mj_kinematics(model, d)
+    lane = jax.tree.map(lambda x: x[0], starts.info["spheres"])
+    seen = env.obstacles(data, lane).boxes
+    assert seen.worked.tolist() == [False, True]
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for name in HANDLE:
+        bar = model.geom(name).id
+        radius, half = model.geom_size[bar, :2]
+        axis = d.geom_xmat[bar].reshape(3, 3)[:, 2]
+        for end in (-half, half):
+            tip = seen.rotation[1].T @ (d.geom_xpos[bar] + end * axis - seen.center[1])
+            low, high = np.minimum(low, tip - radius), np.maximum(high, tip + radius)
+    np.testing.assert_allclose(low, -seen.half_size[1], atol=1e-6)
+    np.testing.assert_allclose(high, seen.half_size[1], atol=1e-6)
+
+
 def test_the_door_opens_towards_the_arm(env):
     """The way of the grip, by plane trigonometry about the hinge at (.70, .20)."""
     t = np.linspace(0.0, GOAL, 5)

@@ -75,6 +75,29 @@ def test_block_and_goal_start_in_their_areas_ten_to_25_centimetres_apart(starts)
     assert turn.max() == pytest.approx(np.pi / 4, abs=0.01)
 
 
+def test_the_tree_keeps_the_links_but_not_the_hand_off_the_block(env, lane):
+    """Place, turn, size and velocities as in MuJoCo C; 1e-6 for float32."""
+    model = env.scene.model
+    d = mujoco.MjData(model)
+    motion = jnp.array([0.1, -0.2, 0.0, 0.3, 0.2, -0.5])
+    data = lane.data.replace(qvel=lane.data.qvel.at[-6:].set(motion))
+    d.qpos[:], d.qvel[:] = data.qpos, data.qvel
+    mujoco.mj_forward(model, d)
+    block, velocity = model.geom("push/block").id, np.zeros(6)
+    mujoco.mj_objectVelocity(model, d, mujoco.mjtObj.mjOBJ_GEOM, block, velocity, 0)
+    seen = env.obstacles(data, lane.info["spheres"]).boxes
+    expected = {
+        "center": d.geom_xpos[block],
+        "rotation": d.geom_xmat[block].reshape(3, 3),
+        "half_size": model.geom_size[block],
+        "velocity": velocity[3:],
+        "angular_velocity": velocity[:3],
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(seen, name)[0], value, atol=1e-6)
+    assert seen.worked.tolist() == [True]
+
+
 def test_a_block_that_is_not_touched_rests(env, lane):
     """It sinks into the soft contact by less than 0.5 mm, in 1 s of MuJoCo C."""
     _, d = settled(env, lane)
