@@ -147,7 +147,9 @@ CASES = (
 )
 
 
-def play(env: ArmEnv, act: Act, episodes: int, steps: int, seed: int):
+def rollout(
+    env: ArmEnv, act: Act, key: Array, episodes: int, steps: int
+) -> dict[str, Array]:
     """Metrics of every step of every episode, (steps, episodes) each.
 
     Steps after an episode's end are in it: see `summarise`.
@@ -164,17 +166,38 @@ def play(env: ArmEnv, act: Act, episodes: int, steps: int, seed: int):
 
         return jax.lax.scan(step, (state, start(env, state)), None, length=steps)[1]
 
-    keys = jax.random.split(jax.random.key(seed), episodes)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(episode, out_axes=1))(keys))
+    return jax.vmap(episode, out_axes=1)(jax.random.split(key, episodes))
+
+
+def play(
+    env: ArmEnv, act: Act, episodes: int, steps: int, seed: int
+) -> dict[str, np.ndarray]:
+    """`rollout`, compiled and run."""
+    run = jax.jit(lambda key: rollout(env, act, key, episodes, steps))
+    return jax.tree.map(np.asarray, run(jax.random.key(seed)))
+
+
+def ends(metrics: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of the first success and the first event; of none, how many there are."""
+    solved = metrics["success"] > 0
+    event = np.any([metrics[e] > 0 for e in EVENTS], axis=0)
+    return _first(solved), _first(event)
+
+
+def _first(on: np.ndarray) -> np.ndarray:
+    return np.where(on.any(0), on.argmax(0), len(on))
+
+
+def solved(metrics: dict[str, np.ndarray]) -> float:
+    """Share of the episodes that succeeded before any event."""
+    first, ended = ends(metrics)
+    return float((first < ended).mean())
 
 
 def summarise(name: str, dt: float, metrics: dict[str, np.ndarray]) -> list[Row]:
     """Success before any event, how long it took, events, forces."""
-    solved = metrics["success"] > 0
-    event = np.any([metrics[e] > 0 for e in EVENTS], axis=0)
-    steps, episodes = solved.shape
-    first = np.where(solved.any(0), solved.argmax(0), steps)
-    ended = np.where(event.any(0), event.argmax(0), steps)
+    steps, episodes = metrics["success"].shape
+    first, ended = ends(metrics)
     good = first < ended
     alive = np.arange(steps)[:, None] <= np.minimum(first, ended)
     in_touch = alive & (metrics["work_force"] > 0)

@@ -1,4 +1,4 @@
-"""Policies that learned nothing: random actions, a straight line, an adversary.
+"""Policies: random actions, a straight line, an adversary; and one that has learned.
 
 A policy is a pair of pure functions of one environment: `start(key) -> memory` and
 `act(memory, key, view) -> (memory, action)`, the action in [-1, 1]^12.
@@ -6,7 +6,7 @@ A policy is a pair of pure functions of one environment: `start(key) -> memory` 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from rmp_mjx import ACTION_SIZE, ActionRange
+from rmp_mjx.training.networks import Agent
 
 MOTION = 6
 """Leading entries of an action that move the set-point; the rest are stiffnesses."""
@@ -27,6 +28,8 @@ class View(NamedTuple):
     """From the end effector to its target, (3,) [m]."""
     to_obstacle: Array
     """Unit vector from the most endangered control point to its obstacle, (3,)."""
+    obs: Array
+    """The task's observation."""
 
 
 class Policy(NamedTuple):
@@ -135,10 +138,26 @@ def adversarial(hold: float = 20.0) -> Policy:
     return Policy(turn.start, act)
 
 
+def trained(agent: Agent) -> Policy:
+    """A trained policy; its memory is not used."""
+
+    def start(key: Array) -> Array:
+        del key
+        return jnp.zeros(ACTION_SIZE)
+
+    def act(memory: Array, key: Array, view: View) -> tuple[Array, Array]:
+        return memory, agent(view.obs[None], key)[0]
+
+    return Policy(start, act)
+
+
+Policies = Mapping[str, Callable[[], Policy]]
+"""Policies by name."""
+
 POLICIES: dict[str, Callable[[], Policy]] = {
     "smooth": smooth,
     "hard": hard,
     "straight": straight,
     "adversarial": adversarial,
 }
-"""The policies by name, with their default parameters."""
+"""Those that learned nothing, with their default parameters."""

@@ -14,11 +14,12 @@ from flax import struct
 from jax import Array
 
 import envs
-from benchmarks.policies import POLICIES, View
+from benchmarks.policies import POLICIES, Policies, View, trained
 from envs.base import ArmEnv
 from envs.spheres import AWAY
 from envs.types import State
 from rmp_mjx import RMPVICES, VICES
+from rmp_mjx.training.networks import Agent
 from rmp_mjx.vec import xyz
 
 EVENTS = ("collision", "arm_collision", "self_collision", "joint_limit", "turn_limit")
@@ -36,6 +37,7 @@ PARTS = (
     "posture",
     "yielding",
     "limit_yielding",
+    "stirring",
     "attractor_weight",
     "regularizer",
 )
@@ -46,7 +48,7 @@ class Group(NamedTuple):
     """Worlds of a batch that share a policy and a scene."""
 
     policy: str
-    """A name in `POLICIES`."""
+    """A name in `POLICIES`, or `trained`."""
     worlds: int
     """How many."""
     layout: str | None = "close"
@@ -87,6 +89,7 @@ class Study:
         steps: int,
         *,
         task: str = "trajectory",
+        agent: Agent | None = None,
         **options: Any,
     ):
         """Build the scene.
@@ -96,9 +99,13 @@ class Study:
             groups: The worlds.
             steps: Policy steps of each.
             task: A name in `envs.names()`.
+            agent: The policy `trained`.
             **options: The task's; two spheres unless it says otherwise.
         """
         self.groups, self.steps = tuple(groups), steps
+        self.policies: Policies = POLICIES
+        if agent is not None:
+            self.policies = POLICIES | {"trained": lambda: trained(agent)}
         speed = max(group.speed or 0.0 for group in self.groups)
         options = {"obstacle_speed": speed} | options
         options = {"obstacles": SPHERES, "sphere_radius": RADIUS} | options
@@ -109,10 +116,8 @@ class Study:
         self, controller: RMPVICES | VICES, seed: int
     ) -> dict[Group, dict[str, np.ndarray]]:
         """Every step's figures by group, (steps, worlds) each."""
-        parts = {}
-        if isinstance(controller, RMPVICES):
-            parts = {name: getattr(controller, name) for name in PARTS}
-        figures = jax.tree.map(np.asarray, self._run(parts, jax.random.key(seed)))
+        figures = self._run(parts_of(controller), jax.random.key(seed))
+        figures = jax.tree.map(np.asarray, figures)
         ends = np.cumsum([g.worlds for g in self.groups])[:-1]
         split = {k: np.split(v, ends, axis=1) for k, v in figures.items()}
         return {
@@ -121,18 +126,19 @@ class Study:
         }
 
     def _simulate(self, parts: dict[str, Any], key: Array) -> dict[str, Array]:
-        env = copy.copy(self.env)
-        env.controller = env.controller.replace(**parts)
-        names = tuple(POLICIES)
+        env = with_parts(self.env, parts)
+        names = tuple(self.policies)
         policy = jnp.array(self._each(lambda g: names.index(g.policy)))
         limit = self._each(lambda g: g.limit)
 
         def one(worlds: World, key: Array) -> tuple[World, dict[str, Array]]:
             key_act, key_reset = jax.random.split(key)
             keys = jax.random.split(key_act, len(policy))
-            worlds, figures = jax.vmap(lambda *x: advance(env, *x))(
-                worlds, keys, policy
-            )
+            worlds, figures = jax.vmap(
+                lambda world, key, policy: advance(
+                    env, world, key, policy, self.policies
+                )
+            )(worlds, keys, policy)
             over = (worlds.state.done > 0) | (worlds.state.info["step"] >= limit)
             figures |= {"over": over, "age": worlds.state.info["step"]}
             worlds = jax.lax.cond(
@@ -172,7 +178,7 @@ class Study:
         keys = jax.random.split(keys, len(policy))
 
         def memory(key: Array, policy: Array) -> Array:
-            starts = [make().start(key) for make in POLICIES.values()]
+            starts = [make().start(key) for make in self.policies.values()]
             return jnp.stack(starts)[policy]
 
         return World(state, jax.vmap(memory)(keys, policy), special)
@@ -193,6 +199,20 @@ class Study:
         """A value of each world's group, (worlds,)."""
         count = [group.worlds for group in self.groups]
         return np.repeat([value(group) for group in self.groups], count)
+
+
+def parts_of(controller: Any) -> dict[str, Any]:
+    """The `PARTS` of RMP-VICES; nothing of another controller."""
+    if not isinstance(controller, RMPVICES):
+        return {}
+    return {name: getattr(controller, name) for name in PARTS}
+
+
+def with_parts(env: ArmEnv, parts: dict[str, Any]) -> ArmEnv:
+    """The environment with these parts of its controller."""
+    env = copy.copy(env)
+    env.controller = env.controller.replace(**parts)
+    return env
 
 
 def _or(value: Any, default: Any) -> Any:
@@ -263,13 +283,17 @@ def _to_obstacle(env: ArmEnv, state: State) -> Array:
 
 
 def advance(
-    env: ArmEnv, world: World, key: Array, policy: Array
+    env: ArmEnv,
+    world: World,
+    key: Array,
+    policy: Array,
+    policies: Policies = POLICIES,
 ) -> tuple[World, dict[str, Array]]:
     """One policy step: the world, and the step's figures."""
     state, env = world.state, under(env, world.special)
     site = env.site(state.data)
-    view = View(to_target(env, state), _to_obstacle(env, state))
-    acts = [make().act(world.memory, key, view) for make in POLICIES.values()]
+    view = View(to_target(env, state), _to_obstacle(env, state), state.obs)
+    acts = [make().act(world.memory, key, view) for make in policies.values()]
     memory, action = (jnp.stack(column)[policy] for column in zip(*acts, strict=True))
     after = env.step(state, action)
     asked = env.controller.decode(action).dpos

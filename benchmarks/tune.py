@@ -1,11 +1,12 @@
 """Tune the default leaves on all tasks at once, against random policies.
 
 Each trial drives many arms with the smooth, hard and adversarial random policies past
-fixed and moving spheres, at the door and at the block, and straight to via points. Two
-figures are minimised: how many of VICES' events are left, and how much of its progress
-is lost. The sampler sees the search seeds only; the report runs today's defaults and
-the best trials on held-out seeds. Run as
-``python -m benchmarks.tune --trials 60 --json FILE``.
+fixed and moving spheres, at the door and at the block, straight and with a trained
+policy to via points, and a scripted expert at the heavy door. Two figures are
+minimised: how many of VICES' events are left, and how much of what a user wants is
+lost: progress, targets that are reached. The sampler sees the search seeds only; the
+report runs today's defaults and the best trials on held-out seeds. Run as
+``python -m benchmarks.tune --run RUN --trials 60 --json FILE``.
 """
 
 from __future__ import annotations
@@ -17,22 +18,37 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import optuna
+from jax import Array
 
+import envs
 import rmp_mjx as rmp
+from benchmarks import experts
 from benchmarks.common import Row, show, write_json
 from benchmarks.random_policies import REACHING_LIMIT, poisson
-from benchmarks.safety_study import Group, Study
+from benchmarks.safety_study import Group, Study, parts_of, with_parts
 from rmp_mjx import runtime
+from rmp_mjx.control.stirring import Stirring
 from rmp_mjx.control.yielding import Yielding, limit_yielding
 from rmp_mjx.rmp.leaves import JointLimitBarrier, Posture
 from rmp_mjx.rmp.leaves.collision import collision_near
 from rmp_mjx.rmp.leaves.joint_limit import joint_limit_barrier
+from rmp_mjx.training import run_folder
+from rmp_mjx.training.config import load_config
+from rmp_mjx.training.networks import Agent
+from rmp_mjx.training.train import load_agent
 
 SEARCH_SEED, REPORT_SEED = 100, 200
 """First of the seeds that the sampler sees, and of those that the report runs."""
+
+STALLED = 200
+"""Policy steps after which a trained policy has stalled if it is not done."""
+
+HEAVY_STARTS, HEAVY_STEPS = 16, 90
+"""Starts of the expert at the heavy door, and its policy steps (it needs 60)."""
 
 
 class Scene(NamedTuple):
@@ -61,9 +77,9 @@ SCENES = (
 class Parameters:
     """What is tuned; the defaults are the leaves' own (a test holds them together)."""
 
-    mu: float = 5e-5
+    mu: float = 7e-5
     """Collision: metric scale."""
-    eps: float = 0.05
+    eps: float = 0.007
     """Collision: velocity floor."""
     eta: float = 20.0
     """Collision: damping [1/s]."""
@@ -71,21 +87,31 @@ class Parameters:
     """Collision: range [m]."""
     margin: float = 0.005
     """Collision: margin [m]."""
-    limit_mu: float = 3.5e-3
+    k_out: float = 2.5e3
+    """Collision: stiffness inside the margin [1/s^2]."""
+    limit_mu: float = 2.5e-3
     """Joint limits: metric scale."""
     limit_margin: float = 0.14
     """Joint limits: margin [rad]."""
-    limit_r: float = 0.25
+    limit_r: float = 0.2
     """Joint limits: range [rad]."""
+    limit_eta: float = 40.0
+    """Joint limits: damping [1/s]."""
+    limit_k_out: float = 2e3
+    """Joint limits: stiffness inside the margin [1/s^2]."""
     kq: float = 2.5
     """Posture: stiffness [1/s^2]."""
     posture: float = 0.02
     """Posture: weight."""
-    least: float = 0.01
+    least: float = 1e-3
     """Yielding: weight of the orientation at an obstacle."""
-    far: float = 0.08
+    near: float = 0.015
+    """Yielding: clearance up to which it has that weight [m]."""
+    far: float = 0.07
     """Yielding: clearance at which it begins [m]."""
-    limit_least: float = 0.01
+    stirring: float = 0.03
+    """Stirring: amplitude [m]."""
+    limit_least: float = 1e-3
     """Yielding near joint limits: weight of the orientation at a limit."""
     limit_far: float = 1.2
     """Yielding near joint limits: distance at which it begins [rad]."""
@@ -94,29 +120,43 @@ class Parameters:
     def suggest(trial: optuna.Trial) -> Parameters:
         """A point of the search space."""
         return Parameters(
-            mu=trial.suggest_float("mu", 1e-5, 1e-3, log=True),
-            eps=trial.suggest_float("eps", 0.02, 0.6, log=True),
-            eta=trial.suggest_float("eta", 8.0, 60.0, log=True),
-            r=trial.suggest_float("r", 0.08, 0.35),
+            mu=trial.suggest_float("mu", 1e-6, 1e-3, log=True),
+            eps=trial.suggest_float("eps", 1e-3, 0.5, log=True),
+            eta=trial.suggest_float("eta", 10.0, 60.0, log=True),
+            r=trial.suggest_float("r", 0.05, 0.3),
             margin=trial.suggest_float("margin", 0.002, 0.02),
-            limit_mu=trial.suggest_float("limit_mu", 1e-3, 1e-1, log=True),
+            k_out=trial.suggest_float("k_out", 100.0, 3e3, log=True),
+            limit_mu=trial.suggest_float("limit_mu", 3e-4, 1e-1, log=True),
             limit_margin=trial.suggest_float("limit_margin", 0.105, 0.16),
-            limit_r=trial.suggest_float("limit_r", 0.15, 1.0, log=True),
+            limit_r=trial.suggest_float("limit_r", 0.05, 1.0, log=True),
+            limit_eta=trial.suggest_float("limit_eta", 10.0, 80.0, log=True),
+            limit_k_out=trial.suggest_float("limit_k_out", 100.0, 5e3, log=True),
             kq=trial.suggest_float("kq", 0.3, 10.0, log=True),
             posture=trial.suggest_float("posture", 0.002, 0.05, log=True),
-            least=trial.suggest_float("least", 1e-3, 0.1, log=True),
+            least=trial.suggest_float("least", 1e-4, 0.1, log=True),
+            near=trial.suggest_float("near", 0.005, 0.035),
             far=trial.suggest_float("far", 0.04, 0.2, log=True),
-            limit_least=trial.suggest_float("limit_least", 1e-3, 0.1, log=True),
+            stirring=trial.suggest_float("stirring", 0.005, 0.05, log=True),
+            limit_least=trial.suggest_float("limit_least", 1e-4, 0.1, log=True),
             limit_far=trial.suggest_float("limit_far", 0.3, 2.0, log=True),
         )
 
     def controller(self, robot: rmp.Robot) -> rmp.RMPVICES:
         """RMP-VICES with these leaves."""
         collision = collision_near().replace(
-            mu=self.mu, eps=self.eps, eta=self.eta, r=self.r, margin=self.margin
+            mu=self.mu,
+            eps=self.eps,
+            eta=self.eta,
+            r=self.r,
+            margin=self.margin,
+            k_out=self.k_out,
         )
         barrier = joint_limit_barrier().replace(
-            mu=self.limit_mu, margin=self.limit_margin, r=self.limit_r
+            mu=self.limit_mu,
+            margin=self.limit_margin,
+            r=self.limit_r,
+            eta=self.limit_eta,
+            k_out=self.limit_k_out,
         )
         return rmp.RMPVICES(
             robot,
@@ -124,7 +164,8 @@ class Parameters:
             self_collision=collision,
             joint_limit=JointLimitBarrier(robot.q_lower, robot.q_upper, barrier),
             posture=Posture(robot.q_home, kq=self.kq, kd=10.0, weight=self.posture),
-            yielding=Yielding(least=self.least, far=self.far),
+            yielding=Yielding(least=self.least, near=self.near, far=self.far),
+            stirring=Stirring(amplitude=self.stirring),
             limit_yielding=limit_yielding().replace(
                 least=self.limit_least, far=self.limit_far
             ),
@@ -167,18 +208,39 @@ class Tally:
 class Bench:
     """All scenes, compiled for one kind of controller."""
 
-    def __init__(self, kind: str, worlds: int, steps: int, armature: str):
+    def __init__(
+        self, kind: str, worlds: int, steps: int, armature: str, agent: Agent | None
+    ):
         """Build them; `worlds` of each policy run for `steps` policy steps."""
         self.studies = {}
         for scene in SCENES:
             groups = [Group(policy, worlds) for policy in scene.policies]
             if scene.name == "fixed":
-                groups.append(Group("straight", worlds, None, REACHING_LIMIT))
-                groups.append(Group("straight", worlds, "far", REACHING_LIMIT))
-                groups.append(Group("straight", worlds, "close", REACHING_LIMIT))
+                groups += [
+                    Group("straight", worlds, layout, REACHING_LIMIT)
+                    for layout in (None, "far", "close")
+                ]
+                if agent is not None:
+                    groups.append(Group("trained", 3 * worlds, "close", STALLED))
             self.studies[scene.name] = Study(
-                kind, groups, steps, task=scene.task, armature=armature, **scene.options
+                kind,
+                groups,
+                steps,
+                task=scene.task,
+                armature=armature,
+                agent=agent,
+                **scene.options,
             )
+        self.heavy = envs.load(
+            "door", controller=kind, armature=armature, variant="heavy"
+        )
+        self._pull = jax.jit(self._play)
+
+    def _play(self, parts: dict[str, Any], key: Array) -> dict[str, Array]:
+        """The expert at the heavy door: metrics of every step and start."""
+        return experts.rollout(
+            with_parts(self.heavy, parts), experts.pull, key, HEAVY_STARTS, HEAVY_STEPS
+        )
 
     def run(self, parameters: Parameters | None, seed: int) -> dict[str, Any]:
         """Tallies by scene and policy; figures of reaching.
@@ -195,17 +257,24 @@ class Bench:
                 # Each task rests at its own start.
                 controller = parameters.controller(study.env.robot)
             for group, figures in study.run(controller, seed).items():
-                if group.policy != "straight":
+                if group.policy not in ("straight", "trained"):
                     tally = tallies.setdefault(f"{name}/{group.policy}", Tally())
                     tally.add(figures)
                     continue
                 solved = figures["success"] > 0
                 missed = figures["over"] & ~solved
-                if group.layout is None:
+                if group.policy == "trained":
+                    reached["trained"] = float(solved.sum() / figures["over"].sum())
+                elif group.layout is None:
                     steps_free = float(figures["age"][solved].mean() / 4)
                 else:
                     hits = float(figures["via_points"].sum())
                     reached[group.layout] = hits / (hits + float(missed.sum()))
+        controller = self.heavy.controller
+        if parameters is not None:
+            controller = parameters.controller(self.heavy.robot)
+        metrics = self._pull(parts_of(controller), jax.random.key(seed))
+        reached["heavy door"] = experts.solved(jax.tree.map(np.asarray, metrics))
         return {"tallies": tallies, "steps_free": steps_free, "reached": reached}
 
 
@@ -290,6 +359,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--worlds", type=int, default=32, help="of each policy")
     parser.add_argument("--steps", type=int, default=320, help="policy steps of each")
     parser.add_argument("--report", type=int, default=4, help="held-out seeds")
+    parser.add_argument("--run", type=Path, help="trajectory run whose policy stalls")
     parser.add_argument("--armature", default="physical", help="of the Jaco 2")
     return parser.parse_args(argv)
 
@@ -298,8 +368,9 @@ def main(argv: list[str] | None = None) -> None:
     """Search, report, and write where asked to."""
     args = parse(argv)
     runtime.configure()
+    agent = policy_of(args.run) if args.run else None
     benches = {
-        kind: Bench(kind, args.worlds, args.steps, args.armature)
+        kind: Bench(kind, args.worlds, args.steps, args.armature, agent)
         for kind in ("vices", "rmp_vices")
     }
     baseline = benches["vices"].run(None, SEARCH_SEED)
@@ -347,6 +418,12 @@ def main(argv: list[str] | None = None) -> None:
         }
         document["trials"] = trials
         args.json.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def policy_of(run: Path) -> Agent:
+    """The mean policy of a trajectory run."""
+    config = load_config(run / run_folder.CONFIG)
+    return load_agent(envs.load("trajectory"), config, run, True, print)[1]
 
 
 def pooled(runs: list[dict[str, Any]]) -> dict[str, Any]:

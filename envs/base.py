@@ -175,7 +175,7 @@ class ArmEnv(abc.ABC):
         rng, key = jax.random.split(info["rng"])
         error = asked.obstacle_noise * jax.random.normal(key, (self.scene.spheres, 3))
         data, spheres, setpoint, record = self.drive(
-            state.data, info["spheres"], action, error
+            state.data, info["spheres"], action, error, self.dt * info["step"]
         )
         step = info["step"] + 1
         task = {name: value for name, value in info.items() if name not in SHARED}
@@ -248,10 +248,12 @@ class ArmEnv(abc.ABC):
         spheres: Spheres,
         action: Float[Array, " 12"],
         error: Array | float = 0.0,
+        time: Array | float = 0.0,
     ) -> tuple[PhysicsState, Spheres, Setpoint, SafetyRecord]:
         """Hold one action for a policy step; the tree runs at every physics step."""
         ctrl, n = self.controller, self.robot.n
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
+        setpoint = setpoint.replace(time=jnp.asarray(time, jnp.float32))  # pyright: ignore[reportAttributeAccessIssue]
 
         def substep(carry, _):
             data, spheres, torques, motion, record = carry

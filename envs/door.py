@@ -210,7 +210,7 @@ class Door(ArmEnv):
 
 
 def _around(capsules: list) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half sizes of the box around capsules of one body, in its frame [m]."""
+    """Centre and half sizes of the box around capsules, in their body's frame [m]."""
     half = [c.size[1] * np.abs(quat_to_mat(c.quat)[:, 2]) + c.size[0] for c in capsules]
     low = np.min([c.pos - h for c, h in zip(capsules, half, strict=True)], axis=0)
     high = np.max([c.pos + h for c, h in zip(capsules, half, strict=True)], axis=0)

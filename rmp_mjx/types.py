@@ -41,6 +41,8 @@ class Setpoint:
     """Translational stiffness [1/s^2]."""
     kp_ori: Float[Array, " 3"]
     """Rotational stiffness [1/s^2]."""
+    time: Float[Array, ""] | float = 0.0
+    """Time of the policy step [s]: what a controller that stirs goes by."""
 
 
 @struct.dataclass

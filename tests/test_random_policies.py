@@ -42,7 +42,7 @@ def test_the_smooth_policy_keeps_its_variance():
     memory = jax.jit(jax.vmap(smooth.start))(jax.random.split(jax.random.key(1), 512))
     keys = jax.random.split(jax.random.key(2), 20 * 512).reshape(20, 512)
     act = jax.jit(jax.vmap(smooth.act, (0, 0, None)))
-    blind = policies.View(jnp.zeros(3), jnp.zeros(3))
+    blind = policies.View(jnp.zeros(3), jnp.zeros(3), jnp.zeros(1))
     for key in keys:
         memory, action = act(memory, key, blind)
         assert (jnp.abs(action) <= 1.0).all()
@@ -54,7 +54,7 @@ def test_the_smooth_policy_keeps_its_variance():
 def test_the_straight_policy_heads_for_the_target_within_the_range(length):
     straight = policies.straight()
     to_target = jnp.array([1.0, -2.0, 0.5]) / 2.0 * length
-    view = policies.View(to_target, jnp.zeros(3))
+    view = policies.View(to_target, jnp.zeros(3), jnp.zeros(1))
     _, action = straight.act(jnp.zeros(12), jax.random.key(0), view)
     dpos = ActionRange().decode(action).dpos
     assert (jnp.abs(action) <= 1.0).all()
@@ -81,7 +81,7 @@ def test_the_adversary_presses_towards_the_obstacle_as_hard_as_it_can():
     memory = adversary.start(jax.random.key(0))
     toward = jnp.array([0.6, 0.0, -0.8])
     _, action = adversary.act(
-        memory, jax.random.key(1), policies.View(jnp.zeros(3), toward)
+        memory, jax.random.key(1), policies.View(jnp.zeros(3), toward, jnp.zeros(1))
     )
     np.testing.assert_allclose(action[:3], toward / 0.8, rtol=1e-6)
     np.testing.assert_allclose(ActionRange().decode(action).kp_pos, 300.0, rtol=1e-5)

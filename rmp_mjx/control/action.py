@@ -62,4 +62,5 @@ def compose_setpoint(
         R_des=jnp.matmul(exp_so3(action.drot), R, precision="highest"),
         kp_pos=action.kp_pos,
         kp_ori=action.kp_ori,
+        time=jnp.zeros((), p.dtype),
     )

@@ -52,5 +52,6 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
         posture=None,
         yielding=None,
         limit_yielding=None,
+        stirring=None,
         regularizer=REGULARIZER,
     )

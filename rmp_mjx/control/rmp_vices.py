@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.avoidance import obstacle_branch, self_branch
+from rmp_mjx.control.stirring import Stirring
 from rmp_mjx.control.torque import scale_torque
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.control.yielding import Yielding, limit_yielding
@@ -76,6 +77,8 @@ class RMPVICES:
     limit_yielding: Yielding | Any | None = ...
     """Weight of the orientation attractor near a joint's limit: a hand that can turn no
     further still moves on. The lesser of the two weights counts."""
+    stirring: Stirring | Any | None = ...
+    """Motion of the set-point that frees a hand which stands beside such a body."""
     regularizer: Float[Array, ""] | float = 1e-3
     """The root's epsilon: damps accelerations that nothing asks for."""
     action_range: ActionRange = struct.field(default_factory=ActionRange)
@@ -97,6 +100,7 @@ class RMPVICES:
             "posture": lambda: Posture(q_0=robot.q_home, kq=2.5, kd=10.0),
             "yielding": Yielding,
             "limit_yielding": limit_yielding,
+            "stirring": Stirring,
         }
         for name, make in defaults.items():
             if getattr(self, name) is ...:
@@ -141,11 +145,14 @@ class RMPVICES:
         Mq, bias = dynamics(self.robot, arm)
         branches, clearance, beside = self._avoidance(arm, obstacles)
         yielded = self._yield(q, beside)
+        site = site_state(self.robot, arm)
+        if self.stirring is not None:
+            stirred = self.stirring(setpoint.time, beside, site.v)
+            setpoint = setpoint.replace(p_des=setpoint.p_des + stirred)  # pyright: ignore[reportAttributeAccessIssue]
         if self.jacobian == "autodiff":
             tree = rmp_vices_tree(self, setpoint, obstacles, Mq, yielded)
             root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
         else:
-            site = site_state(self.robot, arm)
             branches += self._impedance(site, setpoint, yielded)
             if self.joint_limit is not None:
                 branches.append(self.joint_limit(q, qd))

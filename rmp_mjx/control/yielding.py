@@ -22,20 +22,23 @@ class Yielding:
     A state-dependent edge weight of the tree, as in RMPfusion (Li et al., 2019).
     """
 
-    least: Float[Array, ""] | float = 0.01
+    least: Float[Array, ""] | float = 1e-3
     """Weight where there is no room, [m^2/rad^2], > 0; 1: the orientation holds."""
-    near: Float[Array, ""] | float = 0.02
+    near: Float[Array, ""] | float = 0.015
     """Room up to which the weight is ``least``, [m] or [rad]."""
-    far: Float[Array, ""] | float = 0.08
+    far: Float[Array, ""] | float = 0.07
     """Room from which on the weight is 1, [m] or [rad]."""
 
     def __call__(self, room: Float[Array, ""]) -> Float[Array, ""]:
         """The weight at a distance [m] or [rad]; 1 if that is infinite."""
+        return jnp.asarray(self.least, room.dtype) ** self.share(room)
+
+    def share(self, room: Float[Array, ""]) -> Float[Array, ""]:
+        """The share s in [0, 1] of the room that is lost."""
         inside = self.far - jnp.minimum(room, self.far)  # finite gradients at inf
-        share = jnp.minimum(inside / (self.far - self.near), 1.0)
-        return jnp.asarray(self.least, room.dtype) ** share
+        return jnp.minimum(inside / (self.far - self.near), 1.0)
 
 
 def limit_yielding() -> Yielding:
     """Yielding near a joint's limit; room in rad."""
-    return Yielding(least=0.01, near=0.2, far=1.2)
+    return Yielding(least=1e-3, near=0.2, far=1.2)

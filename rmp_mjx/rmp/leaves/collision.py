@@ -18,7 +18,9 @@ def collision_transit() -> Barrier:
 
 def collision_near() -> Barrier:
     """Barrier for work close to surfaces: reaches them more freely; distances in m."""
-    return Barrier(mu=5e-5, eps=0.05, eta=20.0, r=0.2, margin=0.005, cap=1e3, k_out=1e3)
+    return Barrier(
+        mu=7e-5, eps=0.007, eta=20.0, r=0.2, margin=0.005, cap=1e3, k_out=2.5e3
+    )
 
 
 @flax.struct.dataclass
