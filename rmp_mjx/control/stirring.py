@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rmp_mjx.control.yielding import Yielding
 
-RATIOS = np.array([1.0, 0.618, 0.382])
+RATIOS = (1.0, 0.618, 0.382)
 """Rates of the three axes, relative to the first: the curve does not close."""
 
 
@@ -45,5 +45,5 @@ class Stirring:
         """The displacement [m], from time [s], clearance [m] and velocity [m/s]."""
         share = Yielding(near=self.near, far=self.far).share(room)
         still = jnp.exp(-jnp.dot(v, v) / self.speed**2)
-        phase = (2.0 * np.pi * time / self.period) * jnp.asarray(RATIOS, v.dtype)
+        phase = (2.0 * np.pi * time / self.period) * jnp.array(RATIOS)
         return self.amplitude * share * still * jnp.sin(phase)

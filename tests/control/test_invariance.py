@@ -134,9 +134,14 @@ def test_clearance_is_the_distance_to_the_nearest_control_point(
             )
             - rho
             - radius
-            for body, x, rho in robot.control_points
-            for center, radius in zip(
-                near.spheres.center[k, :2], near.spheres.radius[k, :2], strict=True
+            for (body, x, rho), hand in zip(
+                robot.control_points, robot.points.hand, strict=True
             )
+            for center, radius, worked in zip(
+                *(near.spheres.center[k, :2], near.spheres.radius[k, :2]),
+                near.spheres.worked[k, :2],
+                strict=True,
+            )
+            if not (hand and worked)
         ]
         np.testing.assert_allclose(clearance[k], min(gaps), atol=1e-12)

@@ -24,7 +24,8 @@ def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obs
     low = near.planes.replace(point=near.planes.point - 5.0 * UP)
     high = near.planes.replace(point=near.planes.point + 0.4 * UP)
     weights = []
-    holding = ctrl.replace(limit_yielding=None)
+    leaf = Yielding(least=0.01, near=0.02, far=0.08)
+    holding = ctrl.replace(yielding=leaf, limit_yielding=None)
     for planes in (low, high):
         out = run64(holding, q, qd, action, near.replace(planes=planes))
         weights.append(out.diagnostics["orientation_weight"])
@@ -40,7 +41,7 @@ def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obs
 def test_orientation_yields_to_the_nearest_joint_limit(run64, ctrl, states, obstacles):
     """1e-9: float64. Joints without a limit do not count."""
     q, qd, action = states(4)
-    leaf = ctrl.limit_yielding.replace(far=1.0)  # some of the states are further off
+    leaf = Yielding(least=0.01, near=0.2, far=1.0)  # some of the states are further
     holding = ctrl.replace(yielding=None, limit_yielding=leaf)
     out = run64(holding, q, qd, action, obstacles(4))
     weight = out.diagnostics["orientation_weight"]
