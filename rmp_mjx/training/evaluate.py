@@ -7,10 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax.tree_util import Partial
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from rmp_mjx.training import episodes, recording
+from rmp_mjx.training.episodes import EpisodeFold
 from rmp_mjx.training.networks import Agent
 from rmp_mjx.training.recording import Recording
 from rmp_mjx.training.rollout import Env, cast_like, finite_step, select
@@ -21,6 +23,9 @@ from rmp_mjx.training.stats import (
     mean_sd,
 )
 
+LANES = 128
+"""Episodes that run side by side, at most."""
+
 Episodes = dict[str, np.ndarray]
 """One value per episode: `return`, `length`, `lost` (non-finite), and every metric."""
 
@@ -29,8 +34,6 @@ def run_episodes(
     env: Env, agent: Agent, num_episodes: int, key: PRNGKeyArray
 ) -> Episodes:
     """Run episodes in parallel, each from its own start, until all have ended.
-
-    An environment that has ended is frozen: it counts no further.
 
     Args:
         env: Single environment.
@@ -72,36 +75,107 @@ def recorder(
     return record
 
 
+@struct.dataclass
+class _Lanes:
+    """Environments that work through the episodes."""
+
+    state: Any
+    """Their states."""
+    fold: EpisodeFold
+    """What their episodes have accumulated."""
+    episode: Int[Array, " b"]
+    """Which episode each runs."""
+    idle: Bool[Array, " b"]
+    """Whether it has ended."""
+    lost: Bool[Array, " b"]
+    """Whether it became non-finite."""
+
+
 def _run(
     env: Env, num: int, recorded: int, agent: Agent, key: PRNGKeyArray
 ) -> tuple[dict[str, Any], Any]:
+    """Work through the episodes; a lane whose episode has ended takes the next one.
+
+    Lanes wait until there are enough of them for a reset to be worth its time.
+    """
     kinds = env.metric_reductions
     key_reset, key_act = jax.random.split(key)
-    first = jax.vmap(env.reset)(jax.random.split(key_reset, num))
-    first = cast_like(first, first)
+    starts = jax.random.split(key_reset, num)
+    count = min(num, LANES)
     steps = min(env.episode_length, recording.MAX_STEPS)
 
+    def reset(episode):
+        fresh = jax.vmap(env.reset)(starts[jnp.minimum(episode, num - 1)])
+        return cast_like(fresh, fresh)
+
+    def refill(lanes, taken):
+        episode = jnp.where(lanes.idle, taken + jnp.cumsum(lanes.idle) - 1, num)
+        starting = episode < num
+        lanes = _Lanes(
+            state=select(starting, reset(episode), lanes.state),
+            fold=episodes.restart(lanes.fold, starting, kinds),
+            episode=jnp.where(starting, episode, lanes.episode),
+            idle=lanes.idle & ~starting,
+            lost=lanes.lost & ~starting,
+        )
+        return lanes, taken + starting.sum()
+
     def unfinished(carry):
-        _, _, _, done, _, t = carry
-        return ~done.all() & (t < env.episode_length)
+        lanes, taken, *_ = carry
+        return (taken < num) | ~lanes.idle.all()
 
     def step(carry):
-        state, tape, fold, done, lost, t = carry
-        action = agent(state.obs, jax.random.fold_in(key_act, t))
-        new, finite = finite_step(env, state, action)
-        new_fold = episodes.update(fold, new.reward, new.metrics, kinds)
-        state = select(done, state, cast_like(new, state))
-        fold = select(done, fold, new_fold)
-        lost |= ~done & ~finite
-        tape = recording.store(tape, state, t + 1)
-        return state, tape, fold, done | (state.done > 0.5), lost, t + 1
+        lanes, taken, results, tape, t = carry
+        enough = (lanes.idle.sum() >= max(1, count // 8)) | lanes.idle.all()
+        lanes, taken = jax.lax.cond(
+            enough & (taken < num), refill, lambda *same: same, lanes, taken
+        )
+        tape = recording.store(
+            tape, lanes.state, lanes.episode, lanes.fold.length, ~lanes.idle
+        )
+        action = agent(lanes.state.obs, jax.random.fold_in(key_act, t))
+        new, finite = finite_step(env, lanes.state, action)
+        fold = episodes.update(lanes.fold, new.reward, new.metrics, kinds)
+        ended = (new.done > 0.5) | (fold.length >= env.episode_length)
+        lanes = _Lanes(
+            state=select(lanes.idle, lanes.state, cast_like(new, lanes.state)),
+            fold=select(lanes.idle, lanes.fold, fold),
+            episode=lanes.episode,
+            idle=lanes.idle | ended,
+            lost=lanes.lost | ~(lanes.idle | finite),
+        )
+        # Those that go on overwrite what is not final yet.
+        tape = recording.store(
+            tape, lanes.state, lanes.episode, lanes.fold.length, lanes.idle
+        )
+        results = jax.tree.map(
+            lambda every, own: every.at[lanes.episode].set(own),
+            results,
+            (lanes.fold, lanes.lost),
+        )
+        return lanes, taken, results, tape, t + 1
 
-    nobody = jnp.zeros(num, bool)
-    tape = recording.blank(first, recorded, steps)
-    fold = episodes.start(kinds, (num,))
-    start = (first, tape, fold, nobody, nobody, jnp.int32(0))
-    _, tape, fold, _, lost, _ = jax.lax.while_loop(unfinished, step, start)
+    nobody = jnp.zeros(count, bool)
+    blank = jax.tree.map(_zeros, jax.eval_shape(reset, jnp.arange(count)))
+    lanes = _Lanes(
+        state=blank,
+        fold=episodes.start(kinds, (count,)),
+        episode=jnp.arange(count),
+        idle=~nobody,
+        lost=nobody,
+    )
+    results = episodes.start(kinds, (num,)), jnp.zeros(num, bool)
+    tape = recording.blank(blank, recorded, steps)
+    start = (lanes, jnp.int32(0), results, tape, jnp.int32(0))
+    _, _, (fold, lost), tape, _ = jax.lax.while_loop(unfinished, step, start)
     return episodes.finish(fold, kinds) | {"lost": lost}, tape
+
+
+def _zeros(shape: jax.ShapeDtypeStruct) -> Array:
+    """Zeros of a shape; keys where it is one of keys."""
+    if jnp.issubdtype(shape.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jax.random.key(0), shape.shape)
+    return jnp.zeros(shape.shape, shape.dtype)
 
 
 def summarise(results: Episodes, reductions: Mapping[str, str]) -> dict[str, Any]:

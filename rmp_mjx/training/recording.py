@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 MAX_STEPS = 400
 """Policy steps of an episode that are kept."""
@@ -17,8 +17,7 @@ class Recording:
     """The first episodes of an evaluation."""
 
     states: Any
-    """Environment states, (steps + 1, k) leading, NumPy; keys as their raw data. An
-    episode that has ended stays in its last state."""
+    """Environment states, (steps + 1, k) leading, NumPy; keys as their raw data."""
     lengths: Int[np.ndarray, " k"]
     """Steps of each episode, `MAX_STEPS` at most."""
 
@@ -34,19 +33,34 @@ class Recording:
 
 
 def blank(state: Any, count: int, steps: int) -> Any:
-    """A tape for the first `count` environments, filled with the given states."""
+    """An empty tape for `count` episodes of environments with such states (b, ...)."""
 
-    def repeat(x: Array) -> Array:
-        return jnp.broadcast_to(x[:count], (steps + 1, *x[:count].shape))
+    def empty(x: Array) -> Array:
+        return jnp.zeros((steps + 1, count, *x.shape[1:]), x.dtype)
 
-    return jax.tree.map(repeat, _arrays(state))
+    return jax.tree.map(empty, _arrays(state))
 
 
-def store(tape: Any, state: Any, step: Int[Array, ""]) -> Any:
-    """Write a step's states onto the tape; steps beyond its end are dropped."""
+def store(
+    tape: Any,
+    state: Any,
+    episode: Int[Array, " b"],
+    step: Int[Array, " b"],
+    wanted: Bool[Array, " b"],
+) -> Any:
+    """Write states onto the tape; what lies beyond its ends is dropped.
+
+    Args:
+        tape: The tape.
+        state: States of b environments.
+        episode: Their episodes.
+        step: How many steps these have taken.
+        wanted: Which of them to write.
+    """
 
     def write(row: Array, x: Array) -> Array:
-        return row.at[step].set(x[: row.shape[1]], mode="drop")
+        beyond = jnp.where(wanted, step, row.shape[0])
+        return row.at[beyond, episode].set(x, mode="drop")
 
     return jax.tree.map(write, tape, _arrays(state))
 

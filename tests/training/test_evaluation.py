@@ -36,6 +36,20 @@ def test_every_environment_runs_exactly_one_episode(results):
     assert not results["lost"].any()
 
 
+def test_few_lanes_work_through_many_episodes(results, recorded, monkeypatch):
+    """Each as if it had a lane of its own: values, ends and recordings."""
+    monkeypatch.setattr(evaluate, "LANES", 3)
+    again, tape = evaluate.record_episodes(
+        toys.Counter(), zero_agent(1), EPISODES, KEY, recorded=4
+    )
+    for name in set(results) - {"effort"}:  # the agents differ in that alone
+        np.testing.assert_array_equal(again[name], results[name])
+    np.testing.assert_array_equal(tape.lengths, recorded[1].lengths)
+    for episode, length in enumerate(tape.lengths):
+        seen = [float(tape.state(episode, t).obs[1]) for t in range(length + 1)]
+        assert seen == list(range(length + 1))
+
+
 def test_agents_with_the_same_key_meet_the_same_tasks(results):
     other = evaluate.run_episodes(toys.Counter(), zero_agent(1), EPISODES, KEY)
     np.testing.assert_array_equal(other["length"], results["length"])
