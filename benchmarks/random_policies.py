@@ -31,6 +31,7 @@ from rmp_mjx.rmp.leaves import (
     collision_near,
     collision_transit,
 )
+from rmp_mjx.rmp.leaves.joint_limit import joint_limit_barrier
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 
@@ -46,23 +47,23 @@ NEAR = 0.05
 
 HOLDING = rmp.Yielding(least=1.0)
 """The orientation never yields."""
+STILL = rmp.Stirring(amplitude=0.0)
+"""The set-point is never stirred."""
+PLAIN = {"yielding": HOLDING, "limit_yielding": HOLDING, "stirring": STILL}
+"""Nothing that the paper does not have, in the same compiled program."""
 
 
 def _paper(robot: rmp.Robot, signs: str) -> rmp.RMPVICES:
     leaf = PaperCollision(signs=signs)
     limits = RMPflowJointLimit(robot.q_lower, robot.q_upper)
-    return rmp.RMPVICES(
-        robot, leaf, leaf, limits, yielding=HOLDING, limit_yielding=HOLDING
-    )
+    return rmp.RMPVICES(robot, leaf, leaf, limits, **PLAIN)
 
 
 def _off(robot: rmp.Robot) -> rmp.RMPVICES:
     """No safety leaf: a barrier of no weight, which shares the compiled program."""
     off = Barrier(mu=0.0)
     limits = JointLimitBarrier(robot.q_lower, robot.q_upper, off)
-    return rmp.RMPVICES(
-        robot, off, off, limits, yielding=HOLDING, limit_yielding=HOLDING
-    )
+    return rmp.RMPVICES(robot, off, off, limits, **PLAIN)
 
 
 @struct.dataclass
@@ -93,6 +94,15 @@ def _collision(**changes: float) -> Make:
     return lambda robot: rmp.RMPVICES(robot, leaf, leaf)
 
 
+def _soft_wall(robot: rmp.Robot) -> rmp.RMPVICES:
+    leaf, limit = (
+        barrier.replace(k_out=0.05 * barrier.k_out)
+        for barrier in (collision_near(), joint_limit_barrier())
+    )
+    limits = JointLimitBarrier(robot.q_lower, robot.q_upper, limit)
+    return rmp.RMPVICES(robot, leaf, leaf, limits)
+
+
 def _no_curvature(robot: rmp.Robot) -> rmp.RMPVICES:
     leaf = _NoCurvature(**dataclasses.asdict(collision_near()))
     limits = JointLimitBarrier(robot.q_lower, robot.q_upper)
@@ -115,6 +125,11 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
         lambda r: rmp.RMPVICES(r, limit_yielding=HOLDING),
         "orientation does not yield near joint limits",
     ),
+    "no_stirring": (
+        lambda r: rmp.RMPVICES(r, stirring=STILL),
+        "the set-point is not stirred beside obstacles",
+    ),
+    "soft_wall": (_soft_wall, "a twentieth of the stiffness inside the margins"),
     "letting_go_at_once": (
         _collision(v_out=1e-9),
         "the metric ends with the approach",
