@@ -20,7 +20,7 @@ from envs.scene import TABLE_HEIGHT, Contacts, build_scene, no_objects
 from envs.spheres import AWAY, Spheres
 from envs.types import ARM_ENTRIES, METRICS, SHARED, Entry, Score, State
 from rmp_mjx.control import ACTION_SIZE, RMPVICES, VICES
-from rmp_mjx.obstacles import Gap, Obstacles
+from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import (
     SiteState,
@@ -29,6 +29,7 @@ from rmp_mjx.robot.kinematics import (
     forward_kinematics,
     site_state,
 )
+from rmp_mjx.shapes import Gap
 from rmp_mjx.sim import PhysicsState, load_physics
 from rmp_mjx.types import Setpoint
 from rmp_mjx.vec import Vec

@@ -9,7 +9,8 @@ import pytest
 
 import rmp_mjx as rmp
 from benchmarks import tune
-from benchmarks.tune import Parameters, Tally
+from benchmarks.parameters import Parameters
+from benchmarks.tune import Tally
 
 
 def run(steps_free=10.0, reached=1.0, **tallies):

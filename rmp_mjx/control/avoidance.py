@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.obstacles import Gap, Obstacles
+from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf
 from rmp_mjx.robot.kinematics import (
     ArmState,
@@ -20,6 +20,7 @@ from rmp_mjx.robot.kinematics import (
 )
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
+from rmp_mjx.shapes import Gap
 from rmp_mjx.vec import Vec, store, sum_all
 
 CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]

@@ -18,7 +18,7 @@ from rmp_mjx.control.stirring import Stirring
 from rmp_mjx.control.torque import scale_torque
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.control.yielding import Yielding, limit_yielding
-from rmp_mjx.obstacles import KINDS, Obstacles
+from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.rmp.leaves.collision import collision_near
@@ -34,6 +34,7 @@ from rmp_mjx.robot.kinematics import (
 )
 from rmp_mjx.robot.mjcf import unknown
 from rmp_mjx.robot.model import Robot
+from rmp_mjx.shapes import KINDS
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 from rmp_mjx.vec import store
 

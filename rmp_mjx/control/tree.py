@@ -16,12 +16,13 @@ from jaxtyping import Array, Float
 
 from rmp_mjx.control.avoidance import CollisionLeaf, leaf_of
 from rmp_mjx.math import exp_so3, safe_norm
-from rmp_mjx.obstacles import KINDS, Boxes, Capsules, Obstacles, Planes, Spheres
+from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, Leaf, Node, ScalarLeaf, Siblings, TaskMap, identity_map
 from rmp_mjx.rmp.leaves.attractor import OrientationAttractor, PositionAttractor
 from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.kinematics import base_point, forward_kinematics, site_pose
 from rmp_mjx.robot.model import Robot
+from rmp_mjx.shapes import KINDS, Boxes, Capsules, Planes, Spheres
 from rmp_mjx.types import Setpoint
 
 if TYPE_CHECKING:

@@ -144,10 +144,10 @@ def _run(
             idle=lanes.idle | ended,
             lost=lanes.lost | ~(lanes.idle | finite),
         )
-        # Those that go on overwrite what is not final yet.
         tape = recording.store(
             tape, lanes.state, lanes.episode, lanes.fold.length, lanes.idle
         )
+        # Final for those that have ended; the others overwrite it.
         results = jax.tree.map(
             lambda every, own: every.at[lanes.episode].set(own),
             results,

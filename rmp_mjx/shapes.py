@@ -1,0 +1,208 @@
+r"""Shapes of obstacles in padded slots, and their distance to control points.
+
+Every curved obstacle is a core (point, segment, box) inflated by a radius. With
+:math:`g` the vector from the nearest core point and :math:`\dot g` its rate,
+
+.. math::
+    d = |g| - r, \quad \hat n = g / |g|, \quad \dot d = \hat n \cdot \dot g, \quad
+    \ddot d = \hat n \cdot \ddot x + c, \quad
+    c = \hat n \cdot b + (|\dot g|^2 - \dot d^2) / |g|
+
+where :math:`\ddot x` is the control point's acceleration and b the Coriolis and
+centripetal terms of a rotating obstacle. The gradient is a unit normal everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jaxtyping import Bool, Float
+
+from rmp_mjx.vec import Vec
+
+TINY = 1e-9
+"""Core distances below this [m] count as the core itself: the normal is arbitrary."""
+
+
+class Gap(NamedTuple):
+    """Distance of every control point to every obstacle of one kind, (o, p) each."""
+
+    distance: Array
+    """Signed distance between surfaces [m]."""
+    rate: Array
+    """Its rate of change, both motions included [m/s]."""
+    normal: Vec
+    """Unit gradient of the distance with respect to the control point."""
+    curvature: Array
+    """The part of the distance's acceleration that is not normal . xdd [m/s^2]."""
+    active: Array
+    """Whether the control point has to keep off, (o, p)."""
+
+
+@struct.dataclass
+class Spheres:
+    """Balls."""
+
+    center: Float[Array, "o 3"]
+    """Centre, world frame [m]."""
+    radius: Float[Array, " o"]
+    """Radius [m]."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the centre [m/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`."""
+        g = x - Vec.column(self.center)
+        gdot = v - Vec.column(self.velocity)
+        return _inflate(g, gdot, self.radius[:, None] + rho, _avoided(self, hand))
+
+
+@struct.dataclass
+class Planes:
+    """Half-spaces."""
+
+    point: Float[Array, "o 3"]
+    """A point on the surface, world frame [m]."""
+    normal: Float[Array, "o 3"]
+    """Unit normal that points out of the obstacle."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the surface [m/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`."""
+        n = Vec.column(self.normal)
+        distance = n @ (x - Vec.column(self.point)) - rho
+        rate = n @ (v - Vec.column(self.velocity))
+        return Gap(distance, rate, n, jnp.zeros_like(rate), _avoided(self, hand))
+
+
+@struct.dataclass
+class Capsules:
+    """Segments inflated by a radius."""
+
+    center: Float[Array, "o 3"]
+    """Middle of the segment, world frame [m]."""
+    axis: Float[Array, "o 3"]
+    """Unit vector along the segment."""
+    half_length: Float[Array, " o"]
+    """Half the segment's length [m]."""
+    radius: Float[Array, " o"]
+    """Radius [m]."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the centre [m/s]."""
+    angular_velocity: Float[Array, "o 3"]
+    """Angular velocity, world frame [rad/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`."""
+        axis, half = Vec.column(self.axis), self.half_length[:, None]
+        r, rel, coriolis = _ride_along(self, x, v)
+        along = axis @ r
+        free = jnp.abs(along) >= half
+        g = r - axis * jnp.clip(along, -half, half)
+        gdot = rel - axis * jnp.where(free, 0.0, axis @ rel)
+        radius = self.radius[:, None] + rho
+        return _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
+
+
+@struct.dataclass
+class Boxes:
+    """Boxes with rounded edges: a box core inflated by a radius."""
+
+    center: Float[Array, "o 3"]
+    """Centre, world frame [m]."""
+    rotation: Float[Array, "o 3 3"]
+    """Orientation (columns are the box's axes)."""
+    half_size: Float[Array, "o 3"]
+    """Half sizes of the core [m]; the radius comes on top."""
+    radius: Float[Array, " o"]
+    """Rounding radius [m]."""
+    velocity: Float[Array, "o 3"]
+    """Velocity of the centre [m/s]."""
+    angular_velocity: Float[Array, "o 3"]
+    """Angular velocity, world frame [rad/s]."""
+    worked: Bool[Array, " o"]
+    """What the hand works on: the other links alone keep off."""
+    active: Bool[Array, " o"]
+    """Slots in use."""
+
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
+        """See `Obstacles.gaps`.
+
+        Inside the core the distance is minus the depth below the nearest face.
+        """
+        axes = [Vec.column(self.rotation[:, :, i]) for i in range(3)]
+        half = Vec.column(self.half_size)
+        r, rel, coriolis = _ride_along(self, x, v)
+        local, local_v = (Vec(*(a @ w for a in axes)) for w in (r, rel))
+        over = local.map(lambda c, h: jnp.abs(c) - h, half)
+        depth = jnp.maximum(jnp.maximum(over.x, over.y), over.z)
+        inside = depth <= 0.0
+        # Outside, g is what exceeds the core; inside, the normal of the nearest face.
+        x_face = over.x >= depth
+        y_face = (over.y >= depth) & ~x_face
+        face = Vec(x_face, y_face, ~(x_face | y_face))
+        free = face.map(lambda f, o: jnp.where(inside, f, o > 0.0), over)
+        reach = over.map(lambda o: jnp.where(inside, 1.0, o))
+        sign = local.map(lambda c: jnp.where(c < 0.0, -1.0, 1.0))
+        local_g = free.map(lambda f, s, o: jnp.where(f, s * o, 0.0), sign, reach)
+        local_gdot = free.map(lambda f, c: jnp.where(f, c, 0.0), local_v)
+        g, gdot = (
+            axes[0] * w.x + axes[1] * w.y + axes[2] * w.z for w in (local_g, local_gdot)
+        )
+        radius = self.radius[:, None] + rho
+        gap = _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
+        return gap._replace(distance=jnp.where(inside, depth - radius, gap.distance))
+
+
+def _inflate(
+    g: Vec, gdot: Vec, radius: Array, active: Array, coriolis: Vec | None = None
+) -> Gap:
+    """Gap to a core inflated by a radius, from the vector off the core and its rate."""
+    squared = g @ g
+    touching = squared <= TINY**2
+    norm = jnp.sqrt(jnp.where(touching, 1.0, squared))
+    inverse = 1.0 / norm
+    up = jnp.where(touching, 1.0, 0.0)
+    normal = (g * jnp.where(touching, 0.0, inverse)) + Vec(0.0 * up, 0.0 * up, up)
+    rate = normal @ gdot
+    curvature = jnp.where(touching, 0.0, (gdot @ gdot - rate * rate) * inverse)
+    if coriolis is not None:
+        curvature = curvature + normal @ coriolis
+    distance = jnp.where(touching, 0.0, norm) - radius
+    return Gap(distance, rate, normal, curvature, active)
+
+
+def _avoided(kind: Spheres | Planes | Capsules | Boxes, hand: np.ndarray) -> Array:
+    """Which control points keep off which obstacles, (o, p)."""
+    return kind.active[:, None] & ~(kind.worked[:, None] & hand)
+
+
+def _ride_along(body: Capsules | Boxes, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
+    """Position, velocity and Coriolis acceleration seen from a moving obstacle."""
+    omega = Vec.column(body.angular_velocity)
+    r = x - Vec.column(body.center)
+    rdot = v - Vec.column(body.velocity)
+    swept = omega.cross(r)
+    coriolis = omega.cross(swept) - omega.cross(rdot) * 2.0
+    return r, rdot - swept, coriolis
+
+
+KINDS = {Spheres: "spheres", Planes: "planes", Capsules: "capsules", Boxes: "boxes"}
+"""Kinds of obstacles by name."""
