@@ -124,7 +124,7 @@ class Bench:
                 steps,
                 task=scene.task,
                 armature=armature,
-                agent=agent,
+                agent=agent if scene.name == "fixed" else None,
                 **scene.options,
             )
         self.heavy = envs.load(
