@@ -73,6 +73,8 @@ def export(env: Env, run: Path, out: Path, which: str = "newest") -> int:
     small = Checkpointer(out / run_folder.CHECKPOINTS)
     small.save(step, state)
     small.close()
+    for note in out.rglob("commit_success.txt"):  # names the folder of this machine
+        note.write_text("")
     config = dataclasses.replace(config, run_dir=None, resume=None, overwrite=False)
     save_config(config, out / run_folder.CONFIG)
     versions = run / run_folder.VERSIONS
