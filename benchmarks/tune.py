@@ -307,6 +307,7 @@ def main(argv: list[str] | None = None) -> None:
         plot(trials, args.plot)
     if args.json:
         settings = {k: v for k, v in vars(args).items() if k not in ("json", "plot")}
+        settings["run"] = args.run and str(args.run)
         write_json(args.json, rows, **settings)
         document = json.loads(args.json.read_text())
         document["candidates"] = {
