@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import json
 import logging
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -114,7 +115,6 @@ class Checkpointer:
             preservation_policy=retention.AnyPreservationPolicy(kept),
             best_fn=_rank,  # pyright: ignore[reportArgumentType]
             enable_async_checkpointing=False,
-            cleanup_tmp_directories=not read_only,
             create=False,
             read_only=read_only,
             # each process by itself: Orbax would wait for the others otherwise
@@ -126,6 +126,9 @@ class Checkpointer:
         self._manager = self._open()
 
     def _open(self) -> ocp.CheckpointManager:
+        if not self._read_only:  # Orbax's own cleaning outlives a closed manager
+            for half in self._folder.glob("*.orbax-checkpoint-tmp*"):
+                shutil.rmtree(half, ignore_errors=True)
         return ocp.CheckpointManager(self._folder, options=self._options)
 
     def save(
