@@ -78,7 +78,7 @@ def iterate(config: TrainConfig, iterations: int) -> Times:
         middle = time.perf_counter()
         state, _ = jax.block_until_ready(programs.learn(state, data))
         times.append((middle - start, time.perf_counter() - middle))
-    return Times(*np.array(times[WARM_UP:]).T)
+    return Times(*np.array(times[WARM_UP:]).reshape(-1, 2).T)
 
 
 def speed(config: TrainConfig, iterations: int) -> list[Row]:

@@ -1,9 +1,11 @@
 import json
+import time
 
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import bench_controller, common
+from benchmarks import bench_controller, bench_training, common
+from rmp_mjx.training.config import TrainConfig
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +64,16 @@ def test_benchmark_states_are_reproducible_and_inside_the_limits():
     assert (q == again).all()
     assert ((q > robot.q_lower) & (q < robot.q_upper)).all()
     assert int(obstacles.spheres.active.sum()) == bench_controller.SPHERES
+
+
+def test_a_process_that_is_to_take_the_first_step_prints_its_seconds(
+    monkeypatch, capsys
+):
+    small = {"num_envs": 8, "unroll_length": 4, "num_minibatches": 2}
+    monkeypatch.setattr(
+        bench_training,
+        "TrainConfig",
+        lambda **given: TrainConfig(**small, **given),
+    )
+    bench_training.main(["--first_step", str(time.time())])
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) > 0
