@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -236,3 +237,17 @@ def _git_revision() -> str | None:
 def _module_name() -> str:
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     return spec.name if spec else Path(sys.argv[0]).stem
+
+
+def insert(text: str, tables: Mapping[str, str]) -> str:
+    """Replace what stands between a page's `<!-- name -->` and `<!-- end -->`.
+
+    Raises:
+        ValueError: The page has no place for a table.
+    """
+    for name, body in tables.items():
+        place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        text, found = place.subn(lambda m, b=body: f"{m[1]}\n{b}\n\n{m[2]}", text)
+        if not found:
+            raise ValueError(f"the page has no '<!-- {name} -->' ... '<!-- end -->'")
+    return text

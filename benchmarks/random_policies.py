@@ -18,7 +18,7 @@ from flax import struct
 from scipy import stats
 
 import rmp_mjx as rmp
-from benchmarks.common import Row, show, write_json
+from benchmarks.common import Row, insert, show, write_json
 from benchmarks.safety_study import ENDING, EVENTS, Group, Study
 from envs.placement import LAYOUTS
 from rmp_mjx import runtime
@@ -40,6 +40,9 @@ Make = Callable[[rmp.Robot], "rmp.RMPVICES | rmp.VICES"]
 
 REACHING_LIMIT = 300
 """Policy steps after which an episode of four targets ends (15 s)."""
+
+RANDOM = ("smooth", "hard", "adversarial")
+"""Random policies, in the order of the table."""
 
 NEAR = 0.05
 """A clearance below this counts as near an obstacle [m]."""
@@ -165,6 +168,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the options."""
     parser = argparse.ArgumentParser(description="Safety under random policies.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--docs", type=Path, help="renew the table of this page")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few steps")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument("--envs", type=int, default=256, help="worlds side by side")
@@ -187,16 +191,17 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--go-on", action="store_true", help="an event does not end the episode"
     )
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.docs and args.controller:
+        parser.error("--docs needs all controllers: leave --controller out")
+    return args
 
 
 def groups(envs: int, layout: str) -> list[Group]:
     """2/8 of the worlds for each random policy, 1/8 to reach free or among spheres."""
     share = max(envs // 8, 1)
     return [
-        Group("smooth", 2 * share, layout),
-        Group("hard", 2 * share, layout),
-        Group("adversarial", 2 * share, layout),
+        *(Group(policy, 2 * share, layout) for policy in RANDOM),
         Group("straight", share, None, REACHING_LIMIT),
         Group("straight", share, "far", REACHING_LIMIT),
     ]
@@ -299,16 +304,45 @@ def measure_all(args: argparse.Namespace) -> Iterator[list[Row]]:
         yield new
 
 
+def table(rows: list[Row]) -> str:
+    """The ablation as Markdown: a line for each controller."""
+    value = {row.key: row.value for row in rows}
+
+    def cell(name: str, policies: tuple[str, ...], *keys: str, digits: int = 2) -> str:
+        sums = [sum(value[f"{name}_{p}_{key}"] for key in keys) for p in policies]
+        return " / ".join(f"{each:.{digits}g}" for each in sums)
+
+    lines = [
+        "| | collisions, self included, per 1,000 steps | joint limits per 1,000 steps "
+        "| progress, smooth / hard | torque jump p99 [N m], hard / adversarial "
+        "| steps to a via point among spheres |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, (_, what) in CONTROLLERS.items():
+        columns = (
+            f"`{name}`: {what}",
+            cell(name, RANDOM, "collision", "self_collision"),
+            cell(name, RANDOM, "joint_limit"),
+            cell(name, RANDOM[:2], "progress", digits=3),
+            cell(name, RANDOM[1:], "torque_jump_p99"),
+            f"{value.get(f'{name}_spheres_steps', np.nan):.1f}".replace("nan", "-"),
+        )
+        lines.append("| " + " | ".join(columns) + " |")
+    return "\n".join(lines)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write where asked to."""
     args = parse(argv)
     runtime.configure()
-    settings = {k: v for k, v in vars(args).items() if k != "json"}
+    settings = {k: v for k, v in vars(args).items() if k not in ("json", "docs")}
     rows: list[Row] = []
     for new in measure_all(args):
         rows += new
         if args.json:
             write_json(args.json, rows, **settings)
+    if args.docs:
+        args.docs.write_text(insert(args.docs.read_text(), {"ablation": table(rows)}))
 
 
 if __name__ == "__main__":

@@ -8,9 +8,8 @@ defaults. The named failures of `benchmarks.failures` are measured besides. Run 
 from __future__ import annotations
 
 import argparse
-import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import failures
-from benchmarks.common import Row, show, write_json
+from benchmarks.common import Row, insert, show, write_json
 from benchmarks.random_policies import NEAR, REACHING_LIMIT
 from benchmarks.sweeps import (
     AXES,
@@ -104,20 +103,6 @@ def _round(x: float) -> str:
 def _with_interval(outcome: Outcome) -> str:
     low, high = outcome.interval
     return f"{_round(outcome.rate)} ({_round(low)}-{_round(high)})"
-
-
-def insert(text: str, tables: Mapping[str, str]) -> str:
-    """Replace what stands between a page's `<!-- name -->` and `<!-- end -->`.
-
-    Raises:
-        ValueError: The page has no place for a table.
-    """
-    for name, body in tables.items():
-        place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-        text, found = place.subn(lambda m, b=body: f"{m[1]}\n{b}\n\n{m[2]}", text)
-        if not found:
-            raise ValueError(f"the page has no '<!-- {name} -->' ... '<!-- end -->'")
-    return text
 
 
 PANELS = ("noise", "spheres", "torque", "timestep")

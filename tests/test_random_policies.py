@@ -1,11 +1,14 @@
 """The study's policies, intervals and solvers, without running a simulation."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks import policies, random_policies, solve_accuracy
+from benchmarks.common import ROOT, Row, insert
 from rmp_mjx import ActionRange
 
 
@@ -85,3 +88,11 @@ def test_the_adversary_presses_towards_the_obstacle_as_hard_as_it_can():
     )
     np.testing.assert_allclose(action[:3], toward / 0.8, rtol=1e-6)
     np.testing.assert_allclose(ActionRange().decode(action).kp_pos, 300.0, rtol=1e-5)
+
+
+def test_the_table_of_the_ablation_is_that_of_the_committed_rows():
+    stored = json.loads((ROOT / "benchmarks/results/ablation.json").read_text())
+    table = random_policies.table([Row(**row) for row in stored["rows"]])
+    assert table.count("\n") == len(random_policies.CONTROLLERS) + 1
+    page = (ROOT / "docs/ablation.md").read_text()
+    assert insert(page, {"ablation": table}) == page

@@ -9,7 +9,7 @@ import pytest
 
 import envs
 from benchmarks import failures, robustness, safety_study, sweeps
-from benchmarks.common import Row
+from benchmarks.common import Row, insert
 from benchmarks.random_policies import REACHING_LIMIT, poisson
 from benchmarks.safety_study import Group
 from benchmarks.sweeps import AXES, Cell, Outcome, Reaching
@@ -108,17 +108,17 @@ def test_a_table_shows_every_value_beside_what_vices_does():
 def test_tables_go_where_the_page_wants_them_and_nowhere_else():
     page = "a\n<!-- noise -->\nold\n<!-- end -->\nb\n<!-- torque -->\n<!-- end -->\nc"
     tables = {"noise": "| 1 |", "torque": "| 2 |"}
-    new = robustness.insert(page, tables)
-    assert "old" not in new and robustness.insert(new, tables) == new
+    new = insert(page, tables)
+    assert "old" not in new and insert(new, tables) == new
     assert new.startswith("a\n") and new.endswith("\nc") and "\nb\n" in new
     with pytest.raises(ValueError, match="no '<!-- delay -->'"):
-        robustness.insert(page, {"delay": ""})
+        insert(page, {"delay": ""})
 
 
 def test_the_page_has_a_place_for_every_table(root):
     tables = dict.fromkeys((*AXES, *failures.FAILURES), "| new |")
     text = (root / "docs" / "robustness.md").read_text()
-    assert robustness.insert(text, tables).count("| new |") == len(tables)
+    assert insert(text, tables).count("| new |") == len(tables)
 
 
 def test_the_plot_is_drawn(tmp_path):
