@@ -310,7 +310,7 @@ def table(rows: list[Row]) -> str:
 
     def cell(name: str, policies: tuple[str, ...], *keys: str, digits: int = 2) -> str:
         sums = [sum(value[f"{name}_{p}_{key}"] for key in keys) for p in policies]
-        return " / ".join(f"{each:.{digits}g}" for each in sums)
+        return " / ".join(f"{float(f'{each:.{digits}g}'):g}" for each in sums)
 
     lines = [
         "| | collisions, self included, per 1,000 steps | joint limits per 1,000 steps "
