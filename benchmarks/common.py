@@ -239,6 +239,12 @@ def _module_name() -> str:
     return spec.name if spec else Path(sys.argv[0]).stem
 
 
+def markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    rows = [head, ["---"] * len(head), *lines]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
 def insert(text: str, tables: Mapping[str, str]) -> str:
     """Replace what stands between a page's `<!-- name -->` and `<!-- end -->`.
 

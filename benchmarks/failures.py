@@ -6,7 +6,7 @@ Each function runs both controllers and returns rows and a Markdown table;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ from scipy import stats
 
 import envs
 from benchmarks import experts
-from benchmarks.common import Row
+from benchmarks.common import Row, markdown
 from benchmarks.policies import POLICIES, stiffness
 from benchmarks.safety_study import ENDING, World, advance
 from envs import spheres
@@ -128,12 +128,6 @@ def cross(controller: str, cases: Crossing, worlds: int, seed: int) -> list[Figu
     figures = jax.tree.map(np.asarray, jax.jit(both)(keys, cases))
     count = len(cases.offset)
     return [{k: v[:, i] for k, v in figures.items()} for i in range(count)]
-
-
-def markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    rows = [head, ["---"] * len(head), *lines]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def share(hits: Any) -> tuple[float, str]:

@@ -18,7 +18,7 @@ from flax import struct
 from scipy import stats
 
 import rmp_mjx as rmp
-from benchmarks.common import Row, insert, show, write_json
+from benchmarks.common import Row, insert, markdown, show, write_json
 from benchmarks.safety_study import ENDING, EVENTS, Group, Study
 from envs.placement import LAYOUTS
 from rmp_mjx import runtime
@@ -312,14 +312,16 @@ def table(rows: list[Row]) -> str:
         sums = [sum(value[f"{name}_{p}_{key}"] for key in keys) for p in policies]
         return " / ".join(f"{float(f'{each:.{digits}g}'):g}" for each in sums)
 
+    head = (
+        "",
+        "collisions, self included, per 1,000 steps",
+        "joint limits per 1,000 steps",
+        "progress, smooth / hard",
+        "torque jump p99 [N m], hard / adversarial",
+        "steps to a via point among spheres",
+    )
     lines = [
-        "| | collisions, self included, per 1,000 steps | joint limits per 1,000 steps "
-        "| progress, smooth / hard | torque jump p99 [N m], hard / adversarial "
-        "| steps to a via point among spheres |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, (_, what) in CONTROLLERS.items():
-        columns = (
+        (
             f"`{name}`: {what}",
             cell(name, RANDOM, "collision", "self_collision"),
             cell(name, RANDOM, "joint_limit"),
@@ -327,8 +329,9 @@ def table(rows: list[Row]) -> str:
             cell(name, RANDOM[1:], "torque_jump_p99"),
             f"{value.get(f'{name}_spheres_steps', np.nan):.1f}".replace("nan", "-"),
         )
-        lines.append("| " + " | ".join(columns) + " |")
-    return "\n".join(lines)
+        for name, (_, what) in CONTROLLERS.items()
+    ]
+    return markdown(head, lines)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import failures
-from benchmarks.common import Row, insert, show, write_json
+from benchmarks.common import Row, insert, markdown, show, write_json
 from benchmarks.random_policies import NEAR, REACHING_LIMIT
 from benchmarks.sweeps import (
     AXES,
@@ -89,7 +89,7 @@ def table(axis: Axis, results: Results) -> str:
                 f"{100 * ours[-1].share:.1f} ({100 * base[-1].share:.1f})",
             )
         )
-    return failures.markdown(head, lines)
+    return markdown(head, lines)
 
 
 def _pair(outcomes: Sequence[Any], text: Callable[[Outcome], str]) -> str:
