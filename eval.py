@@ -51,7 +51,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 2
     if newer:
         console.print(f"trained with other software: {', '.join(newer)}")
-    runtime.configure()
+    runtime.configure(split_cpu=True)
     tasks = [
         envs.load(c.env, controller=c.controller, physics=c.physics, **setting)
         for c, setting in zip(configs, settings, strict=True)

@@ -88,7 +88,7 @@ def run(config: TrainConfig, console: Console) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     with lock:
-        runtime.configure()
+        runtime.configure(split_cpu=distributed.alone())
         env = envs.load(
             config.env,
             controller=config.controller,

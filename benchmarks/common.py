@@ -21,6 +21,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from rmp_mjx import runtime
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("rmp-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "numpy")
 DEFAULT_FLAGS_SUFFIX = "_default_flags"
@@ -158,7 +160,7 @@ def machine() -> dict[str, Any]:
             versions[package] = "not installed"
     return {
         "cpu": _cpu_name(),
-        "cores": _usable_cores(),
+        "cores": runtime.usable_cores(),
         "memory_gib": _memory_gib(),
         "system": f"{platform.system()} {platform.release()}",
         "devices": sorted({device.device_kind for device in jax.devices()}),
@@ -207,11 +209,6 @@ def _cpu_name() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-def _usable_cores() -> int:
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _memory_gib() -> float:

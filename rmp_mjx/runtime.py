@@ -53,6 +53,7 @@ class Runtime:
 def configure(
     *,
     cpu_flags: bool = True,
+    split_cpu: bool = False,
     compile_cache: bool = True,
     cache_dir: str | os.PathLike[str] | None = None,
     rendering: bool = False,
@@ -60,11 +61,14 @@ def configure(
     """Prepare this process; call it before anything asks JAX for a device.
 
     Safe to call more than once. Settings that the user made (``XLA_FLAGS``,
-    ``JAX_COMPILATION_CACHE_DIR``, ``MUJOCO_GL``) always win.
+    ``JAX_NUM_CPU_DEVICES``, ``JAX_COMPILATION_CACHE_DIR``, ``MUJOCO_GL``) always win.
 
     Args:
         cpu_flags: Append the CPU flags that this jaxlib release needs for fast
             kinematics. They do not affect a GPU.
+        split_cpu: Make every core that this process may use a device of its own, for
+            programs that share their work among devices (`jax.sharding`). XLA hardly
+            spreads one program over several cores.
         compile_cache: Keep compiled programs on disk between runs.
         cache_dir: Folder of that cache. By default
             ``JAX_COMPILATION_CACHE_DIR``, then ``$XDG_CACHE_HOME/rmp_mjx/xla``,
@@ -92,6 +96,8 @@ def configure(
             )
         elif wanted != flags:
             os.environ["XLA_FLAGS"] = flags = wanted
+    if split_cpu:
+        _split_cpu(flags)
     folder = _enable_compile_cache(cache_dir) if compile_cache else None
     return Runtime(flags, folder, choose_gl() if rendering else None)
 
@@ -163,6 +169,20 @@ def gl_loads(name: str) -> bool:
         check=False,
     )
     return probe.returncode == 0
+
+
+def _split_cpu(flags: str) -> None:
+    """One CPU device a core, where the user has not said otherwise."""
+    forced = "--xla_force_host_platform_device_count" in flags
+    chosen = jax.config.jax_num_cpu_devices >= 0  # pyright: ignore
+    if not (forced or chosen or _backend_is_running()):
+        jax.config.update("jax_num_cpu_devices", usable_cores())
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _enable_compile_cache(cache_dir: str | os.PathLike[str] | None) -> Path | None:

@@ -28,8 +28,13 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ[_CACHE] = tempfile.mkdtemp(prefix="rmp-mjx-test-xla-")
         config.stash[_own_cache] = Path(os.environ[_CACHE])
 
+    import jax
+
     from rmp_mjx import runtime
 
+    # Scripts called in this process would split it among its cores, or not, depending
+    # on whether an earlier test has started the backend.
+    jax.config.update("jax_num_cpu_devices", 1)
     runtime.configure(cache_dir=os.environ[_CACHE])
 
 

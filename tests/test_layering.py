@@ -24,7 +24,7 @@ LAW = {
     "obstacles": BASE | {"shapes"},
     "robot": BASE | {"rmp", "obstacles"},
     "control": BASE | {"rmp", "shapes", "obstacles", "robot"},
-    "sim": BASE | {"obstacles", "robot"},
+    "sim": BASE | {"obstacles", "robot", "runtime"},
     "training": {"types", "math", "runtime"},
     "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
 }

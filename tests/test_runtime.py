@@ -52,6 +52,31 @@ def test_the_releases_that_need_the_flags_get_them(version):
     assert "--xla_cpu_use_fusion_emitters=false" in runtime.cpu_xla_flags(version)
 
 
+DEVICES = """
+    import jax
+    from rmp_mjx import runtime
+    runtime.configure(split_cpu={split}, compile_cache=False)
+    print(jax.device_count(), runtime.usable_cores())
+    """
+
+
+def test_a_cpu_that_is_split_has_a_device_for_each_core():
+    devices, cores = run_python(DEVICES.format(split=True)).split()
+    assert devices == cores
+    assert run_python(DEVICES.format(split=False)).split()[0] == "1"
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("XLA_FLAGS", "--xla_force_host_platform_device_count=3"),
+        ("JAX_NUM_CPU_DEVICES", "3"),
+    ],
+)
+def test_the_users_number_of_cpu_devices_is_kept(name, value):
+    assert run_python(DEVICES.format(split=True), **{name: value}).split()[0] == "3"
+
+
 def test_the_installed_jax_accepts_its_flags_and_caches_programs(tmp_path):
     out = run_python(
         """

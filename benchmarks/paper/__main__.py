@@ -55,7 +55,7 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.only:
             wanted = [cells.parse(options.only)]
         if not options.report:
-            runtime.configure()
+            runtime.configure(split_cpu=True)
             code = work.run(
                 place, preset, wanted, console, options.seconds, options.allow_changes
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,9 @@ import mujoco
 import mujoco.batch
 import numpy as np
 from jax import Array
+from jax.experimental.buffer_callback import buffer_callback
 
+from rmp_mjx.runtime import usable_cores
 from rmp_mjx.sim.base import PhysicsState, init_state
 
 
@@ -26,7 +27,7 @@ class MujocoPhysics:
     def __init__(self, model: mujoco.MjModel):
         """Keep the model; batches are made when they are first needed."""
         self.model = model
-        self._idle: dict[tuple[int, int], list[mujoco.batch.Batch]] = {}
+        self._idle: dict[tuple[int, int], list[_Batch]] = {}
 
     def init(
         self, qpos: Array, qvel: Array, mocap_pos: Array | None = None
@@ -40,63 +41,87 @@ class MujocoPhysics:
         A simulation that the engine would reset or stop because its state is bad comes
         back as NaN: it must not look safe.
         """
-        moving = (state.qpos, state.qvel, state.warmstart, state.sensors)
-        shapes = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(jnp.shape(x), x.dtype), moving
+        given = (state.qpos, state.qvel, state.warmstart, state.mocap_pos, ctrl)
+        good = jnp.all(
+            jnp.array([jnp.all(jnp.abs(x) < mujoco.mjMAXVAL) for x in given])
         )
-        qpos, qvel, warmstart, sensors = jax.pure_callback(
-            functools.partial(self._step_host, _threads()),
-            shapes,
-            state.qpos,
-            state.qvel,
-            state.warmstart,
-            state.mocap_pos,
-            ctrl,
-            vmap_method="broadcast_all",
+        harmless = (self.model.qpos0, 0.0, 0.0, 0.0, 0.0)
+        given = [
+            jnp.where(good, x, jnp.asarray(instead, x.dtype))
+            for x, instead in zip(given, harmless, strict=True)
+        ]
+        results = (state.qpos, state.qvel, state.warmstart, state.sensors)
+        shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in results)
+        step = functools.partial(self._step_host, _threads())
+        moved = jax.lax.platform_dependent(
+            *given,
+            cpu=functools.partial(_in_place, step, shapes),
+            default=functools.partial(_by_copies, step, shapes),
         )
+        qpos, qvel, warmstart, sensors = (jnp.where(good, x, jnp.nan) for x in moved)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             qpos=qpos, qvel=qvel, warmstart=warmstart, sensors=sensors
         )
 
-    def _step_host(self, threads, qpos, *others):
-        size = int(np.prod(qpos.shape[:-1], dtype=int))
+    def _step_host(self, threads, out, given):
+        size = int(np.prod(given[0].shape[:-1], dtype=int))
         idle = self._idle.setdefault((size, threads), [])
         try:
             batch = idle.pop()  # one step of a list: no two callers get the same
         except IndexError:
-            batch = mujoco.batch.Batch(self.model, size, threads)
-            batch.bind("sensordata")
-        out = self._step_batch(batch, *map(np.asarray, (qpos, *others)))
+            batch = _Batch(self.model, size, threads)
+        batch.step(out, given)
         idle.append(batch)
-        return out
 
-    def _step_batch(self, batch, qpos, qvel, warmstart, mocap_pos, ctrl):
-        lead, dtype = qpos.shape[:-1], qpos.dtype
-        good = np.ones(batch.nsim, bool)
-        for x in (qpos, qvel, ctrl, mocap_pos):
-            flat = x.reshape(batch.nsim, x.size // batch.nsim)
-            good &= np.all(np.abs(flat) < mujoco.mjMAXVAL, axis=1)
-        mask = good[:, None]
-        batch.qpos[:] = np.where(mask, qpos.reshape(batch.nsim, -1), self.model.qpos0)
-        batch.qvel[:] = np.where(mask, qvel.reshape(batch.nsim, -1), 0.0)
-        batch.qacc_warmstart[:] = np.where(mask, warmstart.reshape(batch.nsim, -1), 0.0)
-        batch.ctrl[:] = np.where(mask, ctrl.reshape(batch.nsim, -1), 0.0)
-        if self.model.nmocap:
-            batch.mocap_pos[:] = mocap_pos.reshape(batch.nsim, -1, 3)
-        batch.time[:] = 1.0
-        batch.step()
+
+class _Batch:
+    """Simulations, and the arrays in which the engine keeps their states."""
+
+    def __init__(self, model: mujoco.MjModel, size: int, threads: int):
+        self.batch = mujoco.batch.Batch(model, size, threads)
+        bind = self.batch.bind
+        moving = [bind(name) for name in ("qpos", "qvel", "qacc_warmstart")]
+        self.given = [*moving, bind("mocap_pos"), bind("ctrl")]
+        self.out = [*moving, bind("sensordata")]
+        self.time = bind("time")
+
+    def step(self, out, given) -> None:
+        """Advance from the arrays given; write into those for the results."""
+        for ours, theirs in zip(self.given, given, strict=True):
+            ours[...] = theirs.reshape(ours.shape)
+        self.time[...] = 1.0
+        self.batch.step()
         # The engine resets a simulation that blows up, its clock included.
-        good &= batch.time.reshape(-1) >= 1.0
-        out = (batch.qpos, batch.qvel, batch.qacc_warmstart, batch.sensordata)
-        return tuple(
-            np.where(good[:, None], x, np.nan).astype(dtype).reshape(*lead, -1)
-            for x in out
-        )
+        reset = self.time.reshape(-1) < 1.0
+        for ours, theirs in zip(self.out, out, strict=True):
+            theirs[...] = ours.reshape(theirs.shape)
+            if reset.any():
+                theirs.reshape(ours.shape)[reset] = np.nan
+
+
+def _in_place(step, shapes, *given):
+    """Call the host where it reads and writes the program's own memory."""
+
+    def call(_, out, *given):
+        step([np.asarray(x) for x in out], [np.asarray(x) for x in given])
+
+    return buffer_callback(call, shapes, vmap_method="broadcast_all")(*given)
+
+
+def _by_copies(step, shapes, *given):
+    """Call the host from another device."""
+
+    def call(*given):
+        lead = given[0].shape[: given[0].ndim - len(shapes[0].shape)]
+        out = [np.empty((*lead, *shape.shape), shape.dtype) for shape in shapes]
+        step(out, [np.asarray(x) for x in given])
+        return tuple(out)
+
+    return jax.pure_callback(call, shapes, *given, vmap_method="broadcast_all")
 
 
 def _threads() -> int:
     """Threads of a batch: the cores, shared by the devices that step at once."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
     mesh = jax.sharding.get_abstract_mesh()  # that of an enclosing shard_map
     here = 1 if mesh.empty else max(1, mesh.size // jax.process_count())
-    return max(1, (cores or os.cpu_count() or 1) // here)
+    return max(1, usable_cores() // here)

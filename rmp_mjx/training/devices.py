@@ -31,14 +31,24 @@ def make_mesh(groups: int, wanted: int | None = None) -> Mesh:
         ConfigError: Several processes could not take part in equal shares.
     """
     devices = jax.devices()
-    most = min(len(devices), wanted or len(devices))
-    count = max(n for n in range(1, most + 1) if groups % n == 0)
+    count = _shares(groups, min(len(devices), wanted or len(devices)))
     if jax.process_count() > 1 and count < len(devices):
         raise ConfigError(
             f"{jax.process_count()} processes have {len(devices)} devices, which do "
             f"not share {groups} groups of environments equally: see num_groups"
         )
     return Mesh(np.array(devices[:count]), (AXIS,))
+
+
+def local_mesh(groups: int) -> Mesh:
+    """As `make_mesh`, of this process's devices alone."""
+    devices = jax.local_devices()
+    return Mesh(np.array(devices[: _shares(groups, len(devices))]), (AXIS,))
+
+
+def _shares(groups: int, most: int) -> int:
+    """The largest number of equal shares, at most so many."""
+    return max(n for n in range(1, most + 1) if groups % n == 0)
 
 
 def spec(axis: int | None) -> PartitionSpec:

@@ -11,7 +11,7 @@ from flax import struct
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from rmp_mjx.training import episodes, recording
+from rmp_mjx.training import devices, episodes, recording
 from rmp_mjx.training.episodes import EpisodeFold
 from rmp_mjx.training.networks import Agent
 from rmp_mjx.training.recording import Recording
@@ -102,6 +102,8 @@ def _run(
     key_reset, key_act = jax.random.split(key)
     starts = jax.random.split(key_reset, num)
     count = min(num, LANES)
+    mesh = devices.local_mesh(count)
+    advance = devices.per_environment(partial(finite_step, env), mesh, (0, 0), 0)
     steps = min(env.episode_length, recording.MAX_STEPS)
 
     def reset(episode):
@@ -134,7 +136,7 @@ def _run(
             tape, lanes.state, lanes.episode, lanes.fold.length, ~lanes.idle
         )
         action = agent(lanes.state.obs, jax.random.fold_in(key_act, t))
-        new, finite = finite_step(env, lanes.state, action)
+        new, finite = advance(lanes.state, action)
         fold = episodes.update(lanes.fold, new.reward, new.metrics, kinds)
         ended = (new.done > 0.5) | (fold.length >= env.episode_length)
         lanes = _Lanes(

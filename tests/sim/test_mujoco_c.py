@@ -57,6 +57,18 @@ def test_in_double_precision_it_is_the_plain_loop_bit_for_bit(engine, jaco, refe
         assert largest_difference(engine, step, jaco, reference, np.float64) == 0.0
 
 
+def test_called_from_another_device_it_does_the_same(engine, step, jaco, monkeypatch):
+    """No other device is here: its branch of the program runs on the CPU."""
+    state, torque = start(engine, jaco, np.float32), jnp.asarray(jaco.torque(0))
+    want = step(state, torque)
+    monkeypatch.setattr(
+        jax.lax, "platform_dependent", lambda *args, cpu, default: default(*args)
+    )
+    other = jax.jit(jax.vmap(lambda state, ctrl: engine.step(state, ctrl)))
+    found = other(state, torque)
+    jax.tree.map(np.testing.assert_array_equal, found, want)
+
+
 def test_in_single_precision_it_is_the_loop_with_a_rounded_state_bit_for_bit(
     engine, step, jaco, reference
 ):
