@@ -19,6 +19,7 @@ from benchmarks.common import (
     Row,
     measure,
     measure_calls,
+    on_all_devices,
     rows_with_default_flags,
     show,
     write_json,
@@ -74,19 +75,23 @@ def random_states(robot: rmp.Robot, batch: int, seed: int):
 
 def throughput(
     ctrl: rmp.RMPVICES | rmp.VICES, batch: int, seed: int, seconds: float
-) -> tuple[Row, Row]:
+) -> tuple[Row, ...]:
     """Evaluations a second of a batch sharing its obstacles, and the compile time."""
     q, qd, action, obstacles = random_states(ctrl.robot, batch, seed)
     setpoint = jax.jit(jax.vmap(ctrl.setpoint))(q, action)
 
     def torque(q, qd, setpoint, obstacles):
-        return jax.vmap(ctrl, in_axes=(0, 0, 0, None))(q, qd, setpoint, obstacles).tau
+        return ctrl(q, qd, setpoint, obstacles).tau
 
-    timing = measure(torque, q, qd, setpoint, obstacles, seconds=seconds)
-    rate = batch / timing.median
+    args, axes = (q, qd, setpoint, obstacles), (0, 0, 0, None)
+    one = measure(jax.vmap(torque, in_axes=axes), *args, seconds=seconds)
+    every = measure(on_all_devices(torque, batch, axes), *args, seconds=seconds)
+    cores = f"on {jax.local_device_count()} devices; {every.spread}"
+    name = f"evals_per_s_batch{batch}"
     return (
-        Row(f"evals_per_s_batch{batch}", rate, "1/s", timing.spread),
-        Row("compile_s", timing.compile_s, "s", f"batch {batch}, no compile cache"),
+        Row(name, batch / one.median, "1/s", one.spread),
+        Row(f"{name}_all_devices", batch / every.median, "1/s", cores),
+        Row("compile_s", one.compile_s, "s", f"batch {batch}, no compile cache"),
     )
 
 
@@ -135,7 +140,7 @@ def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
 def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write where asked to."""
     args = parse(argv)
-    runtime.configure(cpu_flags=not args.worker, compile_cache=False)
+    runtime.configure(cpu_flags=not args.worker, split_cpu=True, compile_cache=False)
     rows = measure_all(args.quick, args.seed, autodiff=not args.worker)
     if args.worker:
         print(json.dumps([asdict(row) for row in rows]))

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 
 import envs
-from benchmarks.common import Row, measure, show, write_json
+from benchmarks.common import Row, measure, on_all_devices, show, write_json
 from rmp_mjx import runtime
 
 ENGINES = ("mujoco", "mjx")
@@ -49,7 +49,7 @@ def measure_engine(
         seconds: Time to spend on each size. [s]
     """
     env = envs.load("trajectory", controller="rmp_vices", physics=engine)
-    reset, step = jax.jit(jax.vmap(env.reset)), jax.vmap(env.step)
+    reset = jax.jit(jax.vmap(env.reset))
     substeps = f"{env.n_substeps} x {env.sim_dt * 1e3:g} ms"
     rows = []
     for size in sizes:
@@ -58,6 +58,7 @@ def measure_engine(
         actions = jax.random.uniform(
             key_action, (WARM_UP + 1, size, env.action_size), minval=-1.0, maxval=1.0
         )
+        step = on_all_devices(env.step, size, (0, 0))
         start = time.perf_counter()
         compiled = jax.jit(step).lower(state, actions[0]).compile()
         compile_s = time.perf_counter() - start
@@ -95,7 +96,7 @@ def controller_time(env, state, action, seconds: float) -> float:
 
         return jax.lax.scan(substep, qd, None, length=env.n_substeps)[0]
 
-    batched = jax.vmap(torques)
+    batched = on_all_devices(torques, len(action), (0, 0, 0))
     args = (state.data, state.info["spheres"], action)
     return measure(batched, *args, seconds=seconds).median
 
@@ -103,7 +104,7 @@ def controller_time(env, state, action, seconds: float) -> float:
 def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write where asked to."""
     args = parse(argv)
-    runtime.configure(compile_cache=False)
+    runtime.configure(split_cpu=True, compile_cache=False)
     sizes = (64,) if args.quick else tuple(args.num_envs)
     seconds = 1.0 if args.quick else args.seconds
     sizes_text = ", ".join(map(str, sizes))

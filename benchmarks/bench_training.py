@@ -131,9 +131,7 @@ def first_steps(seed: int, num_devices: int | None) -> list[Row]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Measure, print, and write where asked to."""
     args = parse(argv)
-    runtime.configure(
-        split_cpu=True, compile_cache=args.first_step is not None
-    )
+    runtime.configure(split_cpu=True, compile_cache=args.first_step is not None)
     config = TrainConfig(seed=args.seed, num_devices=args.num_devices)
     if args.first_step is not None:
         iterate(config, 1 - WARM_UP)

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rmp_mjx import runtime
+from rmp_mjx.training import devices
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("rmp-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "numpy")
@@ -120,6 +121,21 @@ def measure_calls(
         jax.block_until_ready(jitted(*args))
         times[i] = time.perf_counter() - start
     return times
+
+
+def on_all_devices(
+    function: Callable[..., Any], size: int, in_axes: Sequence[int | None]
+) -> Callable[..., Any]:
+    """Vectorise a function, its batch shared by all devices of this process.
+
+    Args:
+        function: For one element.
+        size: Elements of a batch.
+        in_axes: 0 for each argument that has an axis of elements, None for others.
+    """
+    mesh = devices.local_mesh(size)
+    batched = jax.vmap(function, in_axes=tuple(in_axes))
+    return devices.per_environment(batched, mesh, tuple(in_axes), 0)
 
 
 def rows_with_default_flags(module: str, arguments: Sequence[str]) -> list[Row]:

@@ -18,6 +18,7 @@ from mujoco import mjx
 import envs
 import rmp_mjx as rmp
 from benchmarks.bench_controller import BATCH, random_states
+from benchmarks.common import on_all_devices
 from benchmarks.peers.point_mass import ACTION_SIZE, OBSERVATION_SIZE, SETTINGS, Point
 from benchmarks.peers.problem import controller
 from benchmarks.peers.worker import Measure, latency, rate, serve
@@ -45,7 +46,7 @@ def door_steps(engine: str, sim_dt: float) -> Measure:
     start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), size))
     shape = (ACTIONS, size, env.action_size)
     actions = list(jax.random.uniform(jax.random.key(1), shape, minval=-1.0))
-    step = jax.jit(jax.vmap(env.step))
+    step = jax.jit(on_all_devices(env.step, size, (0, 0)))
     states = [start]
     order = itertools.cycle(range(ACTIONS))
 
@@ -57,7 +58,9 @@ def door_steps(engine: str, sim_dt: float) -> Measure:
     return rate(call, size)
 
 
-def torques(make: Callable[..., rmp.RMPVICES | rmp.VICES], batch: int):
+def torques(
+    make: Callable[..., rmp.RMPVICES | rmp.VICES], batch: int, all_devices: bool = False
+):
     """A jitted call of a controller on random states, result ready."""
     robot = rmp.Robot.load("jaco2")
     ctrl = make(robot)
@@ -71,6 +74,8 @@ def torques(make: Callable[..., rmp.RMPVICES | rmp.VICES], batch: int):
     if batch == 1:
         args = jax.tree.map(lambda x: x[0], args)
         jitted = jax.jit(torque)
+    elif all_devices:
+        jitted = jax.jit(on_all_devices(torque, batch, (0, 0, 0)))
     else:
         jitted = jax.jit(jax.vmap(torque))
     return lambda: jax.block_until_ready(jitted(*args))
@@ -153,7 +158,7 @@ def env_physics(engine: str) -> Measure:
     size = DOORS[engine]
     start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), size))
     action = jax.random.uniform(jax.random.key(1), (size, env.action_size), minval=-1.0)
-    step = jax.jit(jax.vmap(env.step))
+    step = jax.jit(on_all_devices(env.step, size, (0, 0)))
     return rate(
         lambda: jax.block_until_ready(step(start, action)), size * env.n_substeps
     )
@@ -198,5 +203,5 @@ def measures() -> dict[str, Callable[[], Measure]]:
 
 
 if __name__ == "__main__":
-    runtime.configure(cpu_flags=DEFAULT_FLAGS not in sys.argv)
+    runtime.configure(cpu_flags=DEFAULT_FLAGS not in sys.argv, split_cpu=True)
     serve(measures(), ("rmp-mjx", "jax", "mujoco", "mujoco-mjx", "numpy"))

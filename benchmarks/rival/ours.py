@@ -11,9 +11,11 @@ import jax
 import envs
 import rmp_mjx as rmp
 from benchmarks.bench_controller import BATCH
+from benchmarks.common import on_all_devices
 from benchmarks.peers.ours import torques
 from benchmarks.peers.worker import Measure, rate, serve
 from rmp_mjx import runtime
+from rmp_mjx.training import devices, seeds
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.ppo import make_ppo
 
@@ -22,7 +24,7 @@ CONTROLLERS = {"rmp_vices": rmp.RMPVICES, "vices": rmp.VICES}
 
 def evals(name: str) -> Measure:
     """Evaluations a second of the whole batch."""
-    return rate(torques(CONTROLLERS[name], BATCH), BATCH)
+    return rate(torques(CONTROLLERS[name], BATCH, all_devices=True), BATCH)
 
 
 def env_steps(name: str, num_envs: int) -> Measure:
@@ -33,7 +35,7 @@ def env_steps(name: str, num_envs: int) -> Measure:
     ]
     shape = (num_envs, env.action_size)
     action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0)
-    step = jax.jit(jax.vmap(env.step))
+    step = jax.jit(on_all_devices(env.step, num_envs, (0, 0)))
 
     def call():
         states[0] = jax.block_until_ready(step(states[0], action))
@@ -45,12 +47,13 @@ def training(name: str, num_envs: int) -> Measure:
     """Policy steps a second of training, updates included."""
     config = TrainConfig(controller=name, physics="mujoco", num_envs=num_envs)
     env = envs.load("trajectory", controller=name, physics="mujoco")
-    ppo = make_ppo(env, config)
-    states = [jax.jit(ppo.init)(jax.random.key(0))]
-    iterate = jax.jit(ppo.iterate)
+    mesh = devices.make_mesh(config.groups)
+    programs = seeds.programs(make_ppo(env, config, mesh), config, mesh)
+    states = [programs.place(programs.init(seeds.keys(config)))]
 
     def call():
-        states[0], *_ = jax.block_until_ready(iterate(states[0]))
+        state, data, _ = programs.gather(states[0])
+        states[0], _ = jax.block_until_ready(programs.learn(state, data))
 
     return rate(call, config.steps_per_iteration)
 
@@ -66,5 +69,5 @@ def measures(num_envs: int) -> dict[str, Callable[[], Measure]]:
 
 
 if __name__ == "__main__":
-    runtime.configure()
+    runtime.configure(split_cpu=True)
     serve(measures(int(sys.argv[1])), ("rmp-mjx", "jax", "mujoco", "numpy"))

@@ -52,16 +52,20 @@ class MlflowClient:
 
 @pytest.fixture
 def fake(tmp_path, monkeypatch):
-    """`fake(name, source)` installs a module of that name."""
+    """`fake(name, source)` installs a module of that name for this test."""
     packages = tmp_path / "packages"
     packages.mkdir()
     monkeypatch.syspath_prepend(packages)
+    installed = []
 
     def install(name, source):
         (packages / f"{name}.py").write_text(source)
-        monkeypatch.delitem(sys.modules, name, raising=False)
+        sys.modules.pop(name, None)
+        installed.append(name)
 
-    return install
+    yield install
+    for name in installed:
+        sys.modules.pop(name, None)
 
 
 def log(folder, config, after=None, rows=(ROW,)):
@@ -84,6 +88,18 @@ def events(folder):
             found.append(Event.FromString(data[12 : 12 + size]))
             data = data[16 + size :]
     return found
+
+
+def records(file):
+    """Records of an offline run: LevelDB's log format, short of one 32 KiB block."""
+    data = file.read_bytes()
+    assert len(data) < 32768
+    data = data[7:]  # the file's own header
+    while data:
+        _, size, kind = struct.unpack("<IHB", data[:7])
+        assert kind == 1  # whole
+        yield data[7 : 7 + size]
+        data = data[7 + size :]
 
 
 def test_tensorboard_shows_each_value_at_its_policy_step(tmp_path):
@@ -141,6 +157,46 @@ def test_mlflow_gets_the_rows_and_a_resumed_run_its_old_entry(tmp_path, fake):
     assert ("log_param", "run7", "env", "trajectory") in said
     assert said.count(("log_metric", "run7", "episode/return", 2.5, 10)) == 2
     assert said[-1] == ("set_terminated", "run7", "FINISHED")
+
+
+def test_weights_and_biases_itself_keeps_the_rows_of_a_run_and_its_continuation(
+    tmp_path, monkeypatch
+):
+    pytest.importorskip("wandb", reason="wandb is not installed (extra 'wandb')")
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    config = TrainConfig(wandb="arm")
+    log(tmp_path, config)
+    log(tmp_path, config, after=10, rows=[ROW | {"steps": 20}])
+    files = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
+    found = [Record.FromString(data) for file in files for data in records(file)]
+    runs = [r.run for r in found if r.WhichOneof("record_type") == "run"]
+    assert {run.run_id for run in runs} == {(tmp_path / "wandb_run").read_text()}
+    rows = [r.history for r in found if r.WhichOneof("record_type") == "history"]
+    items = [{i.key or i.nested_key[0]: i.value_json for i in h.item} for h in rows]
+    assert [item["episode/return"] for item in items] == ["2.5", "2.5"]
+    assert sorted(item["_step"] for item in items) == ["10", "20"]
+
+
+def test_mlflow_itself_keeps_the_rows_of_a_run_and_its_continuation(
+    tmp_path, monkeypatch
+):
+    mlflow = pytest.importorskip(
+        "mlflow", reason="mlflow is not installed (extra 'mlflow')"
+    )
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/tracked.db")
+    config = TrainConfig(mlflow="arm")
+    log(tmp_path, config)
+    log(tmp_path, config, after=10, rows=[ROW | {"steps": 20}])
+    client = mlflow.MlflowClient()
+    experiment = client.get_experiment_by_name("arm")
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert run.info.status == "FINISHED"
+    assert run.data.params["env"] == "trajectory"
+    history = client.get_metric_history(run.info.run_id, "episode/return")
+    assert [(m.step, m.value) for m in history] == [(10, 2.5), (20, 2.5)]
 
 
 def test_a_tracker_that_fails_is_left_alone_and_training_goes_on(tmp_path, fake):
