@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,9 +24,8 @@ import numpy as np
 import envs
 from benchmarks.common import ROOT, Row, show, write_json
 from rmp_mjx import runtime
-from rmp_mjx.training import devices, seeds
+from rmp_mjx.training import seeds
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.ppo import make_ppo
 
 CONTROLLERS = ("vices", "rmp_vices")
 WARM_UP = 2  # iterations before timing: compiling, then buffers and page faults
@@ -65,28 +65,31 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def iterate(config: TrainConfig, iterations: int) -> Times:
-    """Train on trajectory following and time each iteration's halves."""
-    env = envs.load("trajectory", controller=config.controller)
-    mesh = devices.make_mesh(config.groups, config.num_devices)
-    programs = seeds.programs(make_ppo(env, config, mesh), config, mesh)
+def iterations(config: TrainConfig) -> Iterator[tuple[float, float]]:
+    """Train on trajectory following; the seconds of each iteration's halves."""
+    env = envs.load("trajectory", controller=config.controller, physics=config.physics)
+    programs = seeds.programs(env, config)
     state = programs.place(programs.init(seeds.keys(config)))
-    times = []
-    for _ in range(WARM_UP + iterations):
+    while True:
         start = time.perf_counter()
         state, data, _ = jax.block_until_ready(programs.gather(state))
         middle = time.perf_counter()
         state, _ = jax.block_until_ready(programs.learn(state, data))
-        times.append((middle - start, time.perf_counter() - middle))
-    return Times(*np.array(times[WARM_UP:]).reshape(-1, 2).T)
+        yield middle - start, time.perf_counter() - middle
 
 
-def speed(config: TrainConfig, iterations: int) -> list[Row]:
+def iterate(config: TrainConfig, count: int) -> Times:
+    """So many iterations, timed once the program runs smoothly."""
+    times = itertools.islice(iterations(config), WARM_UP, WARM_UP + count)
+    return Times(*np.array(list(times)).T)
+
+
+def speed(config: TrainConfig, count: int) -> list[Row]:
     """Rows of the default run with each controller."""
     rows, shares = [], []
     for controller in CONTROLLERS:
         config = dataclasses.replace(config, controller=controller)
-        times = iterate(config, iterations)
+        times = iterate(config, count)
         rate = config.steps_per_iteration / times.whole
         note = f"{config.num_envs} environments, updates included; {times.spread}"
         rows.append(Row(f"ppo_steps_per_s_{controller}", rate, "1/s", note))
@@ -95,12 +98,12 @@ def speed(config: TrainConfig, iterations: int) -> list[Row]:
     return [*rows, Row("learner_share", float(shares[-1]), "", note)]
 
 
-def cost_of_seeds(config: TrainConfig, iterations: int) -> list[Row]:
+def cost_of_seeds(config: TrainConfig, count: int) -> list[Row]:
     """Time of several seeds in one program over that of one."""
     whole = []
-    for count in (1, SEEDS):
-        config = dataclasses.replace(config, num_envs=SEED_ENVS, num_seeds=count)
-        whole.append(iterate(config, iterations).whole)
+    for num_seeds in (1, SEEDS):
+        config = dataclasses.replace(config, num_envs=SEED_ENVS, num_seeds=num_seeds)
+        whole.append(iterate(config, count).whole)
     note = f"{SEED_ENVS} environments a seed; {whole[0]:.3f} s an iteration of one seed"
     return [Row(f"seeds{SEEDS}_cost_ratio", whole[1] / whole[0], "", note)]
 
@@ -134,14 +137,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     runtime.configure(split_cpu=True, compile_cache=args.first_step is not None)
     config = TrainConfig(seed=args.seed, num_devices=args.num_devices)
     if args.first_step is not None:
-        iterate(config, 1 - WARM_UP)
+        next(iterations(config))
         print(json.dumps(time.time() - args.first_step))
         return
-    iterations = 3 if args.quick else args.iterations
+    count = 3 if args.quick else args.iterations
     rows: list[Row] = []
     for part in (
-        lambda: speed(config, iterations),
-        lambda: cost_of_seeds(config, iterations),
+        lambda: speed(config, count),
+        lambda: cost_of_seeds(config, count),
         lambda: first_steps(args.seed, args.num_devices),
     ):
         rows += part()

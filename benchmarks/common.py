@@ -135,7 +135,7 @@ def on_all_devices(
     """
     mesh = devices.local_mesh(size)
     batched = jax.vmap(function, in_axes=tuple(in_axes))
-    return devices.per_environment(batched, mesh, tuple(in_axes), 0)
+    return devices.per_device(batched, mesh, tuple(in_axes), 0)
 
 
 def rows_with_default_flags(module: str, arguments: Sequence[str]) -> list[Row]:

@@ -11,13 +11,12 @@ import jax
 import envs
 import rmp_mjx as rmp
 from benchmarks.bench_controller import BATCH
+from benchmarks.bench_training import iterations
 from benchmarks.common import on_all_devices
 from benchmarks.peers.ours import torques
 from benchmarks.peers.worker import Measure, rate, serve
 from rmp_mjx import runtime
-from rmp_mjx.training import devices, seeds
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.ppo import make_ppo
 
 CONTROLLERS = {"rmp_vices": rmp.RMPVICES, "vices": rmp.VICES}
 
@@ -46,16 +45,8 @@ def env_steps(name: str, num_envs: int) -> Measure:
 def training(name: str, num_envs: int) -> Measure:
     """Policy steps a second of training, updates included."""
     config = TrainConfig(controller=name, physics="mujoco", num_envs=num_envs)
-    env = envs.load("trajectory", controller=name, physics="mujoco")
-    mesh = devices.make_mesh(config.groups)
-    programs = seeds.programs(make_ppo(env, config, mesh), config, mesh)
-    states = [programs.place(programs.init(seeds.keys(config)))]
-
-    def call():
-        state, data, _ = programs.gather(states[0])
-        states[0], _ = jax.block_until_ready(programs.learn(state, data))
-
-    return rate(call, config.steps_per_iteration)
+    each = iterations(config)
+    return rate(lambda: next(each), config.steps_per_iteration)
 
 
 def measures(num_envs: int) -> dict[str, Callable[[], Measure]]:

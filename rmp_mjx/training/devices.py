@@ -1,8 +1,8 @@
 """Environments spread over devices, the networks on every one of them.
 
 A mesh has one axis, `AXIS`, along which whatever has a row for each environment is cut.
-Roll-outs run apart on each piece (`per_environment`); the rest is one program over all
-of the data, which the compiler divides, gradients summed up included.
+Roll-outs run apart on each piece (`per_device`); the rest is one program over all of
+the data, which the compiler divides, gradients summed up included.
 """
 
 from collections.abc import Callable
@@ -61,24 +61,23 @@ def placed(mesh: Mesh, axis: int | None) -> NamedSharding:
     return NamedSharding(mesh, spec(axis))
 
 
-def per_environment(
+def per_device(
     function: Callable[..., Any], mesh: Mesh, in_axes: Any, out_axes: Any
 ) -> Callable[..., Any]:
-    """Run a function on each device, on its own environments alone.
+    """Run a function on each device, on its own rows alone.
 
     The compiler cannot divide what it cannot see into, such as a simulator behind a
     host callback; this divides by hand.
 
     Args:
-        function: Takes and returns trees of arrays; it treats environments alike and
-            apart.
+        function: Takes and returns trees of arrays; it treats rows alike and apart.
         mesh: The devices.
-        in_axes: For each argument, the axis of its environments; None where it has
-            none. A tree may stand in for all of its leaves.
+        in_axes: For each argument, the axis of its rows; None where it has none. A
+            tree may stand in for all of its leaves.
         out_axes: The same for the results.
 
     Returns:
-        The function over all environments.
+        The function over all rows.
     """
     specs = [
         jax.tree.map(spec, axes, is_leaf=lambda x: x is None)

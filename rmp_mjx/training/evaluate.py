@@ -103,7 +103,7 @@ def _run(
     starts = jax.random.split(key_reset, num)
     count = min(num, LANES)
     mesh = devices.local_mesh(count)
-    advance = devices.per_environment(partial(finite_step, env), mesh, (0, 0), 0)
+    advance = devices.per_device(partial(finite_step, env), mesh, (0, 0), 0)
     steps = min(env.episode_length, recording.MAX_STEPS)
 
     def reset(episode):

@@ -121,7 +121,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig, mesh: Mesh | None = None) ->
         for rate in (config.learning_rate, config.value_learning_rate)
     )
 
-    start = devices.per_environment(
+    start = devices.per_device(
         partial(rollout.init, env, staggered=True), mesh, (0,), 0
     )
 
@@ -239,7 +239,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig, mesh: Mesh | None = None) ->
 
         return rollout.unroll(env, act, state, keys, config.unroll_length)
 
-    unroll = devices.per_environment(unroll, mesh, (None, 0, 0), (0, 1, 0))
+    unroll = devices.per_device(unroll, mesh, (None, 0, 0), (0, 1, 0))
 
     def gather(state: TrainState):
         key, key_unroll = jax.random.split(state.key)

@@ -15,12 +15,17 @@ from jaxtyping import Array, Key
 
 from rmp_mjx.training import devices, run_folder
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.ppo import PPO, TrainState
+from rmp_mjx.training.ppo import PPO, TrainState, make_ppo
+from rmp_mjx.training.rollout import Env
 
 
 class Programs(NamedTuple):
     """The compiled parts of an iteration, for all seeds, on all devices."""
 
+    ppo: PPO
+    """One agent's functions."""
+    mesh: Mesh
+    """The devices."""
     init: Callable[[Any], TrainState]
     """First state, from the seeds' keys."""
     gather: Callable[[TrainState], Any]
@@ -52,14 +57,15 @@ def folders(config: TrainConfig, folder: Path) -> list[Path]:
     return [folder / run_folder.SEEDS / str(number) for number in numbers]
 
 
-def programs(ppo: PPO, config: TrainConfig, mesh: Mesh) -> Programs:
-    """Compile PPO for all seeds and devices.
+def programs(env: Env, config: TrainConfig) -> Programs:
+    """Compile PPO for all seeds; the devices share every agent's environments.
 
     Args:
-        ppo: One agent's functions, made for the same mesh.
+        env: Single environment.
         config: Validated configuration.
-        mesh: The devices.
     """
+    mesh = devices.make_mesh(config.groups, config.num_devices)
+    ppo = make_ppo(env, config, mesh)
     seeded = int(config.num_seeds > 1)
     many = jax.vmap if seeded else lambda function: function
     whole = devices.placed(mesh, None)
@@ -68,6 +74,8 @@ def programs(ppo: PPO, config: TrainConfig, mesh: Mesh) -> Programs:
     state = TrainState(**lies)
     data = devices.placed(mesh, seeded + 1)
     return Programs(
+        ppo=ppo,
+        mesh=mesh,
         init=jax.jit(many(ppo.init), out_shardings=state),
         gather=jax.jit(
             many(ppo.gather), donate_argnums=0, out_shardings=(state, data, whole)

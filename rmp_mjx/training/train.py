@@ -9,13 +9,13 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from rmp_mjx.training import devices, distributed, run_folder, seeds
+from rmp_mjx.training import distributed, run_folder, seeds
 from rmp_mjx.training.checkpoint import NEWEST, Checkpointer
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.logging import RunLogger
 from rmp_mjx.training.metrics import make_rows
 from rmp_mjx.training.networks import Agent, make_agent
-from rmp_mjx.training.ppo import PPO, TrainState, make_ppo
+from rmp_mjx.training.ppo import TrainState, make_ppo
 from rmp_mjx.training.rollout import Env
 from rmp_mjx.training.saving import Saver
 from rmp_mjx.training.stopping import StopRequest, TrainingFailure
@@ -59,9 +59,8 @@ def train(
         TrainingFailure: The simulation or the learner became non-finite, or nothing
             can be saved.
     """
-    mesh = devices.make_mesh(config.groups, config.num_devices)
-    ppo = make_ppo(env, config, mesh)
-    programs = seeds.programs(ppo, config, mesh)
+    programs = seeds.programs(env, config)
+    mesh = programs.mesh
     primary = distributed.is_primary()
     console = console or Console()
     checkpoints = None
@@ -69,7 +68,7 @@ def train(
         kept = config.checkpoints_kept
         place = folder / run_folder.CHECKPOINTS
         checkpoints = Checkpointer(place, kept, config.keep_every, not primary)
-    state, done = _start(ppo, programs, config, checkpoints, console)
+    state, done = _start(programs, config, checkpoints, console)
     changes = run_folder.describe(folder, config) if primary else []
     console.print(f"training on {run_folder.device(mesh.size)}", highlight=False)
     if changes:
@@ -131,7 +130,9 @@ def train(
         )
     normalizer, policy = jax.device_get((state.normalizer, state.learner.policy))
     return TrainResult(
-        agent=make_agent(ppo.networks, normalizer, policy, config.eval_deterministic),
+        agent=make_agent(
+            programs.ppo.networks, normalizer, policy, config.eval_deterministic
+        ),
         iterations=done,
         exit_code=128 + stopping if stopping else 0,
         had_finished=first >= config.num_iterations,
@@ -139,7 +140,6 @@ def train(
 
 
 def _start(
-    ppo: PPO,
     programs: seeds.Programs,
     config: TrainConfig,
     checkpoints: Checkpointer | None,
@@ -152,7 +152,7 @@ def _start(
     if checkpoints is None or not config.resume or nothing:
         # donation wants distinct buffers
         return programs.place(programs.init(seeds.keys(config))), 0
-    done, state = checkpoints.restore(seeds.shapes(ppo, config), console.print)
+    done, state = checkpoints.restore(seeds.shapes(programs.ppo, config), console.print)
     if done >= config.num_iterations:
         console.print(
             f"{config.resume} has finished: {done} iterations; "

@@ -50,7 +50,7 @@ def test_groups_divide_environments_and_minibatches(
 
 def test_a_function_of_each_environment_may_have_arguments_that_all_share():
     mesh = devices.make_mesh(8, 1)
-    double = devices.per_environment(
+    double = devices.per_device(
         lambda factor, x: {"a": factor * x, "b": x.T}, mesh, (None, 0), {"a": 0, "b": 1}
     )
     found = jax.jit(double)(2.0, jax.numpy.arange(6.0).reshape(3, 2))
@@ -72,10 +72,10 @@ env = envs.load("trajectory", controller="vices", physics="mujoco", episode_leng
 
 def trained(num_devices, num_seeds):
     config = TrainConfig(num_envs=8, unroll_length=4, num_minibatches=2,
-                         num_updates_per_batch=2, num_seeds=num_seeds)
-    mesh = devices.make_mesh(config.groups, num_devices)
-    assert mesh.size == num_devices
-    programs = seeds.programs(make_ppo(env, config, mesh), config, mesh)
+                         num_updates_per_batch=2, num_seeds=num_seeds,
+                         num_devices=num_devices)
+    programs = seeds.programs(env, config)
+    assert programs.mesh.size == num_devices
     state = programs.place(programs.init(seeds.keys(config)))
     for _ in range(3):
         state, data, _ = programs.gather(state)
@@ -90,7 +90,8 @@ def difference(one, two):
 
 reference = trained(1, 1)
 print(json.dumps([difference(reference, trained(4, 1)),
-                  difference(reference, trained(2, 2))]))
+                  difference(reference, trained(2, 2)),
+                  difference(reference, trained(2, 3))]))
 """
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from rmp_mjx.training import devices, metrics, run_folder, seeds
+from rmp_mjx.training import metrics, run_folder, seeds
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluate import over_seeds
 from rmp_mjx.training.ppo import make_ppo
@@ -23,8 +23,7 @@ FIRST, COUNT = 3, 3
 def trained(seed, count):
     """State and last learning metrics of `count` seeds after a few iterations."""
     config = TrainConfig(**SMALL, seed=seed, num_seeds=count)
-    mesh = devices.make_mesh(config.groups)
-    programs = seeds.programs(make_ppo(toys.Counter(), config, mesh), config, mesh)
+    programs = seeds.programs(toys.Counter(), config)
     state = programs.place(programs.init(seeds.keys(config)))
     for _ in range(ITERATIONS):
         state, data, stats = programs.gather(state)
