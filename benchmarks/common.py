@@ -249,7 +249,7 @@ def _git_revision() -> str | None:
 
 def _module_name() -> str:
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    return spec.name if spec else Path(sys.argv[0]).stem
+    return spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
 
 
 def markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:

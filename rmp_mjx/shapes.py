@@ -22,7 +22,7 @@ from flax import struct
 from jax import Array
 from jaxtyping import Bool, Float
 
-from rmp_mjx.vec import Vec
+from rmp_mjx.vec import Vec, xyz
 
 TINY = 1e-9
 """Core distances below this [m] count as the core itself: the normal is arbitrary."""
@@ -175,14 +175,14 @@ def _inflate(
     g: Vec, gdot: Vec, radius: Array, active: Array, coriolis: Vec | None = None
 ) -> Gap:
     """Gap to a core inflated by a radius, from the vector off the core and its rate."""
-    squared = g @ g
-    touching = squared <= TINY**2
-    norm = jnp.sqrt(jnp.where(touching, 1.0, squared))
-    inverse = 1.0 / norm
-    up = jnp.where(touching, 1.0, 0.0)
-    normal = (g * jnp.where(touching, 0.0, inverse)) + Vec(0.0 * up, 0.0 * up, up)
+    touching = g @ g <= TINY**2
+    g = Vec(
+        *(jnp.where(touching, up, c) for up, c in zip((0, 0, 1), xyz(g), strict=True))
+    )
+    norm = jnp.sqrt(g @ g)
+    normal = Vec(g.x / norm, g.y / norm, g.z / norm)
     rate = normal @ gdot
-    curvature = jnp.where(touching, 0.0, (gdot @ gdot - rate * rate) * inverse)
+    curvature = jnp.where(touching, 0.0, (gdot @ gdot - rate * rate) / norm)
     if coriolis is not None:
         curvature = curvature + normal @ coriolis
     distance = jnp.where(touching, 0.0, norm) - radius

@@ -80,20 +80,6 @@ def xyz(v: Vec) -> tuple[Array, Array, Array]:
     return v.x, v.y, v.z
 
 
-def sum_all(terms: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Sum several arrays of one shape over their first axis, in a single pass.
-
-    One variadic reduction computes what the terms share once; separate sums would
-    make XLA's CPU backend compute it for each of them.
-    """
-    zeros = tuple(jnp.zeros((), t.dtype) for t in terms)
-
-    def add(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
-        return tuple(x + y for x, y in zip(a, b, strict=True))
-
-    return tuple(jax.lax.reduce(terms, zeros, add, (0,)))
-
-
 def store(x: Array) -> Array:
     """The same array, computed once and stored instead of recomputed by its users.
 
@@ -102,4 +88,9 @@ def store(x: Array) -> Array:
     two operands ends the fusion and is not simplified away.
     """
     padded = jnp.stack([x, jnp.zeros_like(x)])
-    return sum_all((padded, padded))[0]
+    zero = jnp.zeros((), x.dtype)
+
+    def add(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+        return a[0] + b[0], a[1] + b[1]
+
+    return jax.lax.reduce((padded, padded), (zero, zero), add, (0,))[0]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rmp_mjx.vec import Vec, store, sum_all
+from rmp_mjx.vec import Vec, store
 
 RNG = np.random.default_rng(0)
 A, B = (RNG.normal(size=(5, 3)).astype(np.float32) for _ in range(2))
@@ -37,12 +37,6 @@ def test_columns_broadcast_over_points():
 
 def test_stack_broadcasts_components():
     assert Vec(jnp.zeros(4), 0.0, jnp.ones((2, 1))).stack().shape == (3, 2, 4)
-
-
-def test_sums_in_one_pass_are_the_sums():
-    sums = sum_all((jnp.asarray(A), jnp.asarray(B)))
-    for ours, x in zip(sums, (A, B), strict=True):
-        np.testing.assert_allclose(ours, x.sum(0), rtol=1e-6, atol=1e-6)
 
 
 def test_stored_array_is_the_same_array_with_the_same_gradient():

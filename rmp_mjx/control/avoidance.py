@@ -21,7 +21,7 @@ from rmp_mjx.robot.kinematics import (
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
 from rmp_mjx.shapes import Gap
-from rmp_mjx.vec import Vec, store, sum_all
+from rmp_mjx.vec import Vec, store
 
 CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]
 """A leaf for all obstacles, or one for each kind by name (None: not avoided)."""
@@ -75,14 +75,15 @@ def _sum_obstacles(gap: Gap, leaf: ScalarLeaf) -> PointRMP:
     m = jnp.where(gap.active, m, 0.0)
     n = gap.normal
     mn = n * m
-    fx, fy, fz, *metric = sum_all(
-        (
-            *(n.x * f, n.y * f, n.z * f),
-            *(mn.x * n.x, mn.x * n.y, mn.x * n.z),
-            *(mn.y * n.y, mn.y * n.z, mn.z * n.z),
-        )
+
+    def total(share: Array) -> Array:
+        return jnp.sum(share, axis=0)
+
+    return PointRMP(
+        Vec(total(n.x * f), total(n.y * f), total(n.z * f)),
+        *(total(mn.x * n.x), total(mn.x * n.y), total(mn.x * n.z)),
+        *(total(mn.y * n.y), total(mn.y * n.z), total(mn.z * n.z)),
     )
-    return PointRMP(Vec(fx, fy, fz), *metric)
 
 
 def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
