@@ -19,7 +19,8 @@ def test_float32_is_close_to_float64_with_obstacles_near(
     The metrics are capped at 1e3 and the root is regularised by the inertia, so the
     error stays at float32's rounding times the root's condition. Measured, as a share
     of the torque limits: median 2e-6, 90 % 8e-4, 99 % 1e-2, largest 9e-2; the
-    acceleration's largest relative error is 0.11. The bounds leave a factor of three.
+    acceleration's largest relative error is 0.11. Between machines
+    the tails move by a factor of three.
     """
     worst, errors, clearances = 0.0, [], []
     for seed in range(4):
@@ -32,8 +33,8 @@ def test_float32_is_close_to_float64_with_obstacles_near(
         worst = max(worst, np.max(difference / (1.0 + np.abs(double.qdd).max(1))))
     errors, clearances = np.concatenate(errors), np.concatenate(clearances)
     assert np.quantile(errors, 0.5) < 5e-5
-    assert np.quantile(errors, 0.99) < 3e-2
-    assert errors.max() < 0.3
+    assert np.quantile(errors, 0.99) < 1.5e-2
+    assert errors.max() < 0.1
     assert worst < 0.3
     assert np.mean(clearances < 0.05) > 0.5
 
