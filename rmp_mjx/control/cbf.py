@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -11,6 +12,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from rmp_mjx.control.avoidance import self_gaps
+from rmp_mjx.control.projection import project
 from rmp_mjx.control.torque import clip_torque
 from rmp_mjx.control.vices import VICES
 from rmp_mjx.math import psd_solve
@@ -22,13 +24,11 @@ from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.vec import Vec
 
-UNIT = 30.0
-"""Size of a large correction, to scale the program by [sqrt(kg m^2) rad/s^2]."""
-TOLERANCE, ITERATIONS = 1e-4, 30
-"""Residual of the scaled program at which the solver stops, and when it gives up.
-Float32 reaches it; at ten times as much accelerations are off by some per cent."""
-LARGEST = 10.0
-"""What a barrier may ask for at most, in units of the scaled program."""
+LARGEST = 300.0
+"""Change that a barrier may ask for at most [sqrt(kg m^2) rad/s^2]."""
+KEPT = 48
+"""Constraints of the program: those with the least room. The others are looked at after
+it is solved."""
 FREE = 1e-3
 """Rows shorter than this are left out: the joints cannot move that distance."""
 
@@ -53,7 +53,7 @@ class FilteredVICES(VICES):
     r"""The acceleration that VICES' torques give, changed as little as safety needs.
 
     .. math::
-        \min_{\ddot q} \tfrac12 \|\ddot q - \ddot q_{VICES}\|^2_{M_q}
+        \min_{\ddot q} \|\ddot q - \ddot q_{VICES}\|^2_{M_q}
         \quad \text{s.t.} \quad
         \ddot d_i + 2 \alpha \dot d_i + \alpha^2 d_i \ge 0, \quad
         |M_q \ddot q + b| \le \tau_{max}
@@ -62,10 +62,8 @@ class FilteredVICES(VICES):
     links' capsules to each other, and of every joint to its limits: the same points,
     obstacles and margins as `RMPVICES`. They have relative degree 2; the gains put both
     poles at :math:`-\alpha`, so that a distance decays without overshoot. Where not all
-    can hold, each may be violated at a cost in proportion (an exact penalty), and the
-    torque is clipped in the end.
-
-    Needs the extra `cbf`.
+    can hold, each is violated at a cost that grows with its square (see `project`),
+    and the torque is clipped in the end.
 
     Source: Nguyen and Sreenath, "Exponential control barrier functions" (2016); Khazoom
     et al., "Humanoid self-collision avoidance using whole-body control with control
@@ -78,12 +76,8 @@ class FilteredVICES(VICES):
     """Distance that is kept [m]."""
     limit_margin: Float[Array, ""] | float = 0.12
     """Room that is kept to a joint's limit [rad]."""
-    penalty: Float[Array, ""] | float = 100.0
-    """Cost of a violation, in units of the scaled program."""
-
-    def __post_init__(self):
-        """Find the solver before anything long starts."""
-        _solver()
+    penalty: Float[Array, ""] | float = 1e3
+    """Cost of a squared violation over that of a squared change."""
 
     def __call__(
         self,
@@ -95,7 +89,8 @@ class FilteredVICES(VICES):
         """Torque for one state; same signature as `RMPVICES`.
 
         Returns:
-            As `VICES`; diagnostics also has `solved`, 1 where the program converged.
+            As `VICES`; diagnostics also has `solved`, 1 where the program converged and
+            the constraints that it leaves out hold.
         """
         tau = super().__call__(q, qd, setpoint, obstacles).tau
         arm = arm_state(self.robot, q, qd)
@@ -135,8 +130,8 @@ class FilteredVICES(VICES):
     ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
         """The nearest admissible acceleration, and whether it was found.
 
-        The program's variable is the change in the inertia's norm, in units of `UNIT`,
-        and its rows have length 1.
+        The program's variable is the change in the inertia's norm, and its rows have
+        length 1.
         """
         need = (
             barriers.drift
@@ -144,32 +139,21 @@ class FilteredVICES(VICES):
             + self.rate**2 * barriers.distance
         )
         tau_max = jnp.asarray(self.robot.tau_max, Mq.dtype)
-        low, high = ((-tau_max - bias), (tau_max - bias))
         G = jnp.concatenate([-barriers.rows, Mq, -Mq])
-        h = jnp.concatenate([need, high, -low]) - G @ wanted
+        h = jnp.concatenate([need, tau_max - bias, tau_max + bias]) - G @ wanted
         limits = jnp.ones(2 * self.robot.n, bool)
-        active = jnp.concatenate([barriers.active, limits])
-
         L = jnp.linalg.cholesky(Mq)
-        G = solve_triangular(L, G.T, lower=True).T
-        length = jnp.linalg.norm(G, axis=1)
-        active &= length > FREE
+        G = solve_triangular(L, G.T, lower=True)
+        length = jnp.sqrt(jnp.sum(G * G, axis=0))
+        active = jnp.concatenate([barriers.active, limits]) & (length > FREE)
         scale = jnp.where(active, 1.0 / jnp.where(active, length, 1.0), 0.0)
-        G = G * scale[:, None]
-        h = jnp.where(active, jnp.clip(h * scale / UNIT, -LARGEST, LARGEST), 1.0)
-        n = self.robot.n
-        change, *_, converged, _ = _solver()(
-            jnp.eye(n, dtype=G.dtype),
-            jnp.zeros(n, G.dtype),
-            G,
-            h,
-            self.penalty,
-            solver_tol=TOLERANCE,
-            max_iter=ITERATIONS,
-        )
-        change = jnp.where(jnp.isfinite(change).all(), change, 0.0)
-        qdd = wanted + solve_triangular(L.T, UNIT * change, lower=False)
-        return qdd, converged.astype(qdd.dtype)
+        G = G * scale
+        h = jnp.where(active, jnp.clip(h * scale, -LARGEST, LARGEST), LARGEST)
+        room, kept = jax.lax.top_k(-h, min(KEPT, len(h)))
+        change, solved = project(G[:, kept], -room, self.penalty)
+        beyond = jnp.where(h > -room[-1], change @ G - h, 0.0)
+        solved = jnp.where(jnp.any(beyond > 0.0), 0.0, solved)
+        return wanted + solve_triangular(L.T, change, lower=False), solved
 
 
 def _beyond(barriers: Barriers, margin: Array | float) -> Barriers:
@@ -224,18 +208,3 @@ def _joints(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> Barr
         jnp.concatenate([eye, -eye]),
         limited,
     )
-
-
-def _solver():
-    """The elastic solver of qpax.
-
-    Raises:
-        ImportError: The extra `cbf` is not installed.
-    """
-    try:
-        from qpax.explicit.elastic_qp import solve_qp_elastic
-    except ImportError as error:
-        raise ImportError(
-            "vices_cbf needs the extra `cbf`: pip install 'rmp-mjx[cbf]'"
-        ) from error
-    return solve_qp_elastic

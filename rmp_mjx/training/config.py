@@ -25,7 +25,7 @@ class TrainConfig:
     controller: str = "rmp_vices"
     """Low-level controller that the policy commands: rmp_vices, vices,
     rmp_vices_literal (the paper's formulas with their signs corrected), osc (vices with
-    a fixed impedance), or vices_cbf (vices behind a safety filter; extra `cbf`)."""
+    a fixed impedance), or vices_cbf (vices behind a safety filter)."""
     physics: str = "auto"
     """Physics engine: mujoco (C threads), mjx (JAX), warp (MuJoCo Warp; extra `warp`),
     or auto: mujoco on a CPU, else mjx."""

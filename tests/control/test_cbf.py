@@ -1,7 +1,5 @@
 """The safety filter against an exact solver, on an arm that compiles fast."""
 
-import sys
-
 import jax
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from rmp_mjx.robot.kinematics import arm_state
 from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 
-pytest.importorskip("qpax")
 clarabel = pytest.importorskip("clarabel")
 
 from scipy import sparse  # noqa: E402
@@ -70,7 +67,7 @@ def run(filtered, states):
 
 
 def exact(ctrl, wanted, barriers, Mq, bias):
-    """The elastic program by Clarabel, in joint accelerations; None: not solved."""
+    """The soft program by Clarabel, in joint accelerations."""
     n, on = len(wanted), barriers.active
     alpha = ctrl.rate
     need = barriers.drift + 2 * alpha * barriers.rate + alpha**2 * barriers.distance
@@ -80,40 +77,48 @@ def exact(ctrl, wanted, barriers, Mq, bias):
     length = np.linalg.norm(np.linalg.solve(np.linalg.cholesky(Mq), G.T), axis=0)
     movable = length > cbf.FREE
     G, h, length = G[movable], h[movable], length[movable]
-    most = cbf.LARGEST * cbf.UNIT * length
+    most = cbf.LARGEST * length
     h = G @ wanted + np.clip(h - G @ wanted, -most, most)
+    # Violations in units of the scaled rows: G x - length t <= h.
     m = len(h)
-    # Slack in the units of the scaled program: t >= 0, G x - length UNIT t <= h.
-    cost = sparse.block_diag([Mq.astype(float), sparse.csc_matrix((m, m))]).tocsc()
-    linear = np.concatenate(
-        [-Mq.astype(float) @ wanted, np.full(m, ctrl.penalty * cbf.UNIT**2)]
-    )
-    slack = sparse.diags(length * cbf.UNIT)
-    A = sparse.bmat([[sparse.csc_matrix(G), -slack], [None, -sparse.eye(m)]]).tocsc()
-    b = np.concatenate([h, np.zeros(m)])
+    cost = sparse.block_diag([Mq.astype(float), ctrl.penalty * sparse.eye(m)])
+    linear = np.concatenate([-Mq.astype(float) @ wanted, np.zeros(m)])
+    A = sparse.hstack([sparse.csc_matrix(G), -sparse.diags(length)]).tocsc()
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    cone = [clarabel.NonnegativeConeT(2 * m)]
+    cone = [clarabel.NonnegativeConeT(m)]
     solution = clarabel.DefaultSolver(
-        sparse.triu(cost).tocsc(), linear, A, b, cone, settings
+        sparse.triu(cost).tocsc(), linear, A, h, cone, settings
     ).solve()
-    return np.array(solution.x[:n]), np.array(solution.x[n:])
+    return np.array(solution.x[:n])
+
+
+def distance(Mq, gap):
+    """Norm of differences of accelerations in the inertia [sqrt(kg m^2) rad/s^2]."""
+    return np.sqrt(np.einsum("bi,bij,bj->b", gap, Mq, gap))
 
 
 def test_the_program_is_solved_as_by_clarabel(filtered, run):
-    """Within 1 % of `UNIT` in the inertia's norm in 95 % of the states, 10 % in all:
-    the solver stops at a residual of 1e-4, and float32 does not go much further."""
+    """Within 1e-4 in the median and 1e-3 of the change in all states, changes being
+    tens of sqrt(kg m^2) rad/s^2: float32, with a condition of 1e3 by the penalty."""
     out, vices, barriers, (Mq, bias) = run
-    assert out.diagnostics["solved"].mean() > 0.95
-    errors, changed = [], 0
-    for k in np.flatnonzero(out.diagnostics["solved"]):
-        one = cbf.Barriers(*(x[k] for x in barriers))
-        qdd, _ = exact(filtered, vices[k].astype(float), one, Mq[k], bias[k])
-        gap = out.qdd[k] - qdd
-        errors.append(np.sqrt(gap @ Mq[k] @ gap) / cbf.UNIT)
-        changed += np.abs(qdd - vices[k]).max() > 1.0
-    assert changed > 10
-    assert np.quantile(errors, 0.95) < 0.01 and max(errors) < 0.1
+    assert out.diagnostics["solved"].all()
+    qdd = np.array(
+        [
+            exact(
+                filtered,
+                vices[k].astype(float),
+                cbf.Barriers(*(x[k] for x in barriers)),
+                Mq[k],
+                bias[k],
+            )
+            for k in range(STATES)
+        ]
+    )
+    error = distance(Mq, out.qdd - qdd)
+    change = distance(Mq, qdd - vices)
+    assert (change > 1.0).sum() > 10
+    assert np.median(error) < 1e-4 and (error < 1e-3 * (1.0 + change)).all()
 
 
 def test_barriers_are_distances_and_their_time_derivatives(filtered, states):
@@ -151,20 +156,13 @@ def test_barriers_are_distances_and_their_time_derivatives(filtered, states):
 
 
 def test_where_nothing_is_near_it_is_vices(filtered, run):
-    """Wherever VICES' own acceleration keeps every barrier; 1 % of `UNIT`: the
-    solver's tolerance."""
+    """Wherever VICES' own acceleration keeps every barrier and torque limit: the
+    program's start is its solution, up to float32's error in the torque."""
     out, vices, barriers, (Mq, _) = run
     need = barriers.drift + 2 * filtered.rate * barriers.rate
     need = need + filtered.rate**2 * barriers.distance
     room = need + np.einsum("bmn,bn->bm", barriers.rows, vices)
     free = (room > 0.0).all(1, where=barriers.active)
     assert free.sum() > 2
-    gap = (out.qdd - vices)[free]
-    error = np.sqrt(np.einsum("bi,bij,bj->b", gap, Mq[free], gap)) / cbf.UNIT
-    assert error.max() < 0.01
-
-
-def test_it_says_what_to_install_without_its_solver(filtered, monkeypatch):
-    monkeypatch.setitem(sys.modules, "qpax.explicit.elastic_qp", None)
-    with pytest.raises(ImportError, match=r"rmp-mjx\[cbf\]"):
-        cbf.FilteredVICES(filtered.robot)
+    error = distance(Mq[free], (out.qdd - vices)[free])
+    assert error.max() < 1e-2
