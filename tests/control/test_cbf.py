@@ -99,7 +99,7 @@ def distance(Mq, gap):
 
 
 def test_the_program_is_solved_as_by_clarabel(filtered, run):
-    """Within 1e-4 in the median and 1e-3 of the change in all states, changes being
+    """Within 1e-4 in the median and 2e-3 of the change in all states, changes being
     tens of sqrt(kg m^2) rad/s^2: float32, with a condition of 1e3 by the penalty."""
     out, vices, barriers, (Mq, bias) = run
     assert out.diagnostics["solved"].all()
@@ -118,7 +118,7 @@ def test_the_program_is_solved_as_by_clarabel(filtered, run):
     error = distance(Mq, out.qdd - qdd)
     change = distance(Mq, qdd - vices)
     assert (change > 1.0).sum() > 10
-    assert np.median(error) < 1e-4 and (error < 1e-3 * (1.0 + change)).all()
+    assert np.median(error) < 1e-4 and (error < 2e-3 * (1.0 + change)).all()
 
 
 def test_barriers_are_distances_and_their_time_derivatives(filtered, states):
