@@ -21,6 +21,7 @@ from envs.spheres import AWAY, Spheres
 from envs.types import ARM_ENTRIES, METRICS, SHARED, Entry, Score, State
 from rmp_mjx.control import ACTION_SIZE, RMPVICES, VICES
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.rmp import ScalarLeaf
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import (
     SiteState,
@@ -71,6 +72,9 @@ class ArmEnv(abc.ABC):
         controller = asked.controller
         if isinstance(controller, str):
             controller = options.CONTROLLERS[controller](robot)
+            leaves = self.collision_leaves(robot)
+            if asked.controller == "rmp_vices" and leaves:
+                controller = controller.replace(collision=leaves)
         self.robot: Robot = robot
         self.controller: RMPVICES | VICES = controller
         self.scene = build_scene(
@@ -88,6 +92,10 @@ class ArmEnv(abc.ABC):
         self.metric_reductions = METRICS | self.task_metrics
 
     # What a task says.
+
+    def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
+        """Leaves of `rmp_vices` by kind of obstacle, where the default does not fit."""
+        return {}
 
     @property
     @abc.abstractmethod

@@ -15,8 +15,12 @@ from envs.base import ArmEnv
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, Contacts
 from envs.types import Entry, Score
+from rmp_mjx.control import per_link
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.rmp import ScalarLeaf
+from rmp_mjx.rmp.leaves import collision_near
+from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
 
@@ -185,6 +189,15 @@ class Door(ArmEnv):
         held = jnp.where(resting, task["held"] + 1, 0)
         task = {"held": held, "grip_force": record.work_force}
         return Score(task, reward, held >= self.hold, {"door_angle": angle})
+
+    def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
+        """Forces at the handle press the arm against spheres and panel: it keeps off."""
+        near = collision_near()
+        panel = per_link(robot, [0.015] * (robot.n - 1) + [float(near.margin)])
+        return {
+            "spheres": near.replace(margin=0.01),
+            "boxes": near.replace(margin=panel),
+        }
 
     @property
     def task_entries(self) -> tuple[Entry, ...]:
