@@ -191,9 +191,9 @@ class Door(ArmEnv):
         return Score(task, reward, held >= self.hold, {"door_angle": angle})
 
     def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
-        """Forces at the handle press the arm against spheres and panel: it keeps off."""
+        """Further off spheres and panel: forces at the handle press the arm on."""
         near = collision_near()
-        panel = per_link(robot, [0.015] * (robot.n - 1) + [float(near.margin)])
+        panel = per_link(robot, np.array([0.015] * (robot.n - 1) + [0.005]))
         return {
             "spheres": near.replace(margin=0.01),
             "boxes": near.replace(margin=panel),

@@ -92,7 +92,7 @@ class Push(ArmEnv):
     """The block counts as pushed home within this distance of the goal [m]."""
 
     def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
-        """Forces at the block press the hand against spheres: stiffer, further walls."""
+        """Further and stiffer for spheres: forces at the block press the hand on."""
         return {"spheres": collision_near().replace(margin=0.015, k_out=1e4, eta=40.0)}
 
     @property
