@@ -6,6 +6,8 @@ import pytest
 import envs
 from envs.options import substeps
 from envs.types import METRICS
+from rmp_mjx import RMPVICES
+from rmp_mjx.rmp.leaves import PaperCollision, collision_near
 
 
 def test_an_unknown_task_lists_the_tasks_and_suggests_one():
@@ -69,3 +71,25 @@ def test_only_the_watched_pairs_can_collide():
         assert f"{link}/sphere_0" in pairs and f"{link}/sphere_1" in pairs
     assert np.all(scene.hand.astype(int) + scene.arm + scene.own + scene.work == 1)
     assert np.sum(scene.hand) == 2 * 3  # hand and fingers, with table and two spheres
+
+
+@pytest.mark.parametrize("task", ["door", "push"])
+def test_where_the_hand_works_the_tree_keeps_further_off_spheres(task):
+    """The default leaf elsewhere, for controllers of one's own, and for the others."""
+    env = envs.load(task, physics="mujoco")
+    near, leaves = collision_near(), env.collision_leaves(env.robot)
+    assert env.controller.collision["spheres"] == leaves["spheres"]
+    assert leaves["spheres"].margin > near.margin
+    assert env.controller.collision["planes"] == near
+    own = RMPVICES(env.robot)
+    assert envs.load(task, physics="mujoco", controller=own).controller is own
+    literal = envs.load(task, physics="mujoco", controller="rmp_vices_literal")
+    assert isinstance(literal.controller.collision, PaperCollision)
+
+
+def test_the_hand_may_come_nearer_to_the_doors_panel_than_the_other_links():
+    env = envs.load("door", physics="mujoco")
+    margin = np.asarray(env.controller.collision["boxes"].margin)
+    hand = np.array(env.robot.points.segment) == env.robot.n - 1
+    assert (margin[hand] == np.float32(0.005)).all()
+    assert (margin[~hand] == np.float32(0.015)).all()
