@@ -335,6 +335,14 @@ def test_pages_are_the_same_from_the_store_alone(grid, pages, tmp_path):
     assert [p.read_bytes() for p in again] == [p.read_bytes() for p in pages]
 
 
+def test_the_count_of_targets_is_that_of_the_tables_rows(pages):
+    text = next(p for p in pages if p.suffix == ".md").read_text()
+    counts = [text.count(f"| {word} |") for word in ("met", "NOT MET", "undecided")]
+    said = "Of {} targets {} are met, {} are not, and {} are undecided:"
+    assert sum(counts) == 33 and counts[2] < 33
+    assert said.format(33, *counts) in text
+
+
 def test_targets_without_measurements_are_said_to_be_unmeasured(grid):
     empty = targets.targets(Store(grid[0].folder / "nothing"))
     assert len(empty) == 33

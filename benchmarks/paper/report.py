@@ -79,12 +79,13 @@ def _summary(place: Store, preset: Preset) -> list[Block]:
 
 def _targets(place: Store) -> list[Block]:
     found = targets.targets(place)
-    met, failed = (sum(t.met is value for t in found) for value in (True, False))
+    verdicts = [target.verdict for target in found]
+    met, failed, undecided = map(verdicts.count, ("met", "NOT MET", "undecided"))
     return [
         Heading("Targets"),
         Text(
             f"Of {len(found)} targets {met} are met, {failed} are not, and "
-            f"{len(found) - met - failed} are undecided: not measured, measured in "
+            f"{undecided} are undecided: not measured, measured in "
             "fewer than 100 episodes, or with nothing to compare. A verdict goes by "
             "the measured value; the interval says how far it can be trusted. "
             "Intervals of changes are paired bootstraps "
