@@ -193,7 +193,7 @@ class Door(ArmEnv):
     def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
         """Further off spheres and panel: forces at the handle press the arm on."""
         near = collision_near()
-        panel = per_link(robot, np.array([0.015] * (robot.n - 1) + [0.005]))
+        panel = per_link(robot, np.append(np.full(robot.n - 1, 0.015), near.margin))
         return {
             "spheres": near.replace(margin=0.01),
             "boxes": near.replace(margin=panel),

@@ -1,4 +1,4 @@
-"""What MuJoCo C and Pinocchio say about an arm: quantities the library must match."""
+"""What MuJoCo C, Pinocchio and Clarabel say: quantities the library must match."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from scipy import sparse
 
 
 class Terms(NamedTuple):
@@ -70,3 +71,21 @@ def without_limits_or_passive_forces(model: mujoco.MjModel) -> mujoco.MjModel:
     model.dof_damping[:] = 0.0
     model.jnt_stiffness[:] = 0.0
     return model
+
+
+def soft_program(clarabel, P, q, G, h, length, penalty) -> np.ndarray:
+    """Clarabel's x of min x'Px/2 + q'x + penalty t't/2 with Gx - length t <= h."""
+    m = len(h)
+    cost = sparse.block_diag([P, penalty * sparse.eye(m)])
+    A = sparse.hstack([sparse.csc_matrix(G), -sparse.diags(length)])
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    solver = clarabel.DefaultSolver(
+        sparse.triu(cost).tocsc(),
+        np.concatenate([q, np.zeros(m)]),
+        A.tocsc(),
+        h,
+        [clarabel.NonnegativeConeT(m)],
+        settings,
+    )
+    return np.array(solver.solve().x[: len(q)])

@@ -149,10 +149,10 @@ class FilteredVICES(VICES):
         scale = jnp.where(active, 1.0 / jnp.where(active, length, 1.0), 0.0)
         G = G * scale
         h = jnp.where(active, jnp.clip(h * scale, -LARGEST, LARGEST), LARGEST)
-        room, kept = jax.lax.top_k(-h, min(KEPT, len(h)))
-        change, solved = project(G[:, kept], -room, self.penalty)
-        beyond = jnp.where(h > -room[-1], change @ G - h, 0.0)
-        solved = jnp.where(jnp.any(beyond > 0.0), 0.0, solved)
+        _, kept = jax.lax.top_k(-h, min(KEPT, len(h)))
+        change, solved = project(G[:, kept], h[kept], self.penalty)
+        left_out = h > h[kept[-1]]
+        solved *= ~jnp.any(left_out & (change @ G > h))
         return wanted + solve_triangular(L.T, change, lower=False), solved
 
 

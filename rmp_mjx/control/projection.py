@@ -41,7 +41,6 @@ def project(
     active set strategy as a semismooth Newton method" (2002).
     """
     eye = jnp.eye(len(G), dtype=G.dtype)
-    steps = jnp.array(STEPS, G.dtype)
 
     def newton(state):
         x, _, count = state
@@ -55,13 +54,13 @@ def project(
             + penalty * jnp.sum(jnp.maximum(over + t * rise, 0.0) ** 2)
             for t in STEPS
         ]
-        step = steps[jnp.argmin(jnp.stack(costs))] * step
+        step *= jnp.array(STEPS, G.dtype)[jnp.argmin(jnp.array(costs))]
         return x + step, jnp.max(jnp.abs(step)), count + 1
 
     def goes_on(state):
         _, moved, count = state
         return (moved > TOLERANCE) & (count < ITERATIONS)
 
-    start = (jnp.zeros_like(eye[0]), jnp.array(jnp.inf, G.dtype), 0)
+    start = (jnp.zeros(len(G), G.dtype), jnp.array(jnp.inf, G.dtype), 0)
     x, moved, _ = jax.lax.while_loop(goes_on, newton, start)
     return x, jnp.asarray(moved <= TOLERANCE, G.dtype)

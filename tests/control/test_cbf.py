@@ -7,12 +7,11 @@ import pytest
 from rmp_mjx import VICES, Obstacles, Robot
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
+from tests import oracles
 from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 
 clarabel = pytest.importorskip("clarabel")
-
-from scipy import sparse  # noqa: E402
 
 from rmp_mjx.control import cbf  # noqa: E402
 
@@ -68,7 +67,7 @@ def run(filtered, states):
 
 def exact(ctrl, wanted, barriers, Mq, bias):
     """The soft program by Clarabel, in joint accelerations."""
-    n, on = len(wanted), barriers.active
+    on = barriers.active
     alpha = ctrl.rate
     need = barriers.drift + 2 * alpha * barriers.rate + alpha**2 * barriers.distance
     tau_max = np.asarray(ctrl.robot.tau_max, float)
@@ -79,18 +78,9 @@ def exact(ctrl, wanted, barriers, Mq, bias):
     G, h, length = G[movable], h[movable], length[movable]
     most = cbf.LARGEST * length
     h = G @ wanted + np.clip(h - G @ wanted, -most, most)
-    # Violations in units of the scaled rows: G x - length t <= h.
-    m = len(h)
-    cost = sparse.block_diag([Mq.astype(float), ctrl.penalty * sparse.eye(m)])
-    linear = np.concatenate([-Mq.astype(float) @ wanted, np.zeros(m)])
-    A = sparse.hstack([sparse.csc_matrix(G), -sparse.diags(length)]).tocsc()
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    cone = [clarabel.NonnegativeConeT(m)]
-    solution = clarabel.DefaultSolver(
-        sparse.triu(cost).tocsc(), linear, A, h, cone, settings
-    ).solve()
-    return np.array(solution.x[:n])
+    Mq = Mq.astype(float)
+    # Violations in units of the scaled rows.
+    return oracles.soft_program(clarabel, Mq, -Mq @ wanted, G, h, length, ctrl.penalty)
 
 
 def distance(Mq, gap):

@@ -1,15 +1,16 @@
 """The projection onto soft half-spaces against an exact solver."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rmp_mjx.control.projection import project
+from tests import oracles
 
 clarabel = pytest.importorskip("clarabel")
-
-from scipy import sparse  # noqa: E402
 
 N, M, BATCH, PENALTY = 7, 48, 64, 1e3
 
@@ -24,25 +25,14 @@ def programs():
     return G / np.linalg.norm(G, axis=1, keepdims=True), h
 
 
-def exact(G, h):
-    """Clarabel's solution, the violations as variables of their own."""
-    m = len(h)
-    cost = sparse.block_diag([sparse.eye(N), PENALTY * sparse.eye(m)]).tocsc()
-    A = sparse.hstack([sparse.csc_matrix(G.T), -sparse.eye(m)]).tocsc()
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    cone = [clarabel.NonnegativeConeT(m)]
-    solver = clarabel.DefaultSolver(cost, np.zeros(N + m), A, h, cone, settings)
-    return np.array(solver.solve().x[:N])
-
-
 def test_projections_are_clarabels(programs):
     """Relative to changes of some hundreds: 1e-4, float32 with a condition of 1e3."""
     G, h = programs
     solve = jax.jit(jax.vmap(lambda G, h: project(G, h, PENALTY)))
     x, solved = jax.device_get(solve(jnp.float32(G), jnp.float32(h)))
     assert solved.all()
-    wanted = np.array([exact(*program) for program in zip(G, h, strict=True)])
+    soft = partial(oracles.soft_program, clarabel, np.eye(N), np.zeros(N))
+    wanted = np.array([soft(G[k].T, h[k], np.ones(M), PENALTY) for k in range(BATCH)])
     size = np.linalg.norm(wanted, axis=1)
     assert np.median(size) > 10.0
     assert np.linalg.norm(x - wanted, axis=1).max() < 1e-4 * size.max()
