@@ -64,7 +64,8 @@ def training(place: Store, path: Path, variants: Sequence[str] = PAPER) -> None:
 def _curve(axis, curves: measures.Curves, variant: str) -> None:
     mean, (low, high) = measures.band(curves.values)
     x, style = curves.steps / 1e3, VARIANTS[variant]
-    label = f"{style.label}, {len(curves.seeds)} seeds"
+    count = len(curves.seeds)
+    label = f"{style.label}, {count} seed{'s' if count > 1 else ''}"
     axis.plot(x, mean, color=style.color, lw=1.3, label=label)
     axis.fill_between(x, low, high, color=style.color, alpha=0.2, lw=0)
 
