@@ -88,11 +88,31 @@ def measure(
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     compile_s = time.perf_counter() - start
+    return Timing(
+        compile_s,
+        time_calls(
+            compiled, *args, seconds=seconds, max_calls=max_calls, min_calls=min_calls
+        ),
+    )
+
+
+def time_calls(
+    compiled: Callable[..., Any],
+    *args: Any,
+    seconds: float,
+    max_calls: int = 2000,
+    min_calls: int = 5,
+) -> np.ndarray:
+    """Time the calls of a compiled program with the result awaited, as `measure` does.
+
+    Returns:
+        Wall time of each call; of the first alone where that takes too long. (n,) [s]
+    """
     start = time.perf_counter()
     jax.block_until_ready(compiled(*args))  # buffers, thread pools, page faults
     first = time.perf_counter() - start
     if first > seconds:  # hopelessly slow: one call says enough
-        return Timing(compile_s, np.array([first]))
+        return np.array([first])
     calls: list[float] = []
     deadline = time.perf_counter() + seconds
     while len(calls) < min_calls or (
@@ -101,7 +121,7 @@ def measure(
         start = time.perf_counter()
         jax.block_until_ready(compiled(*args))
         calls.append(time.perf_counter() - start)
-    return Timing(compile_s, np.array(calls))
+    return np.array(calls)
 
 
 def measure_calls(

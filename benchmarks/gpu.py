@@ -1,15 +1,32 @@
 """One sweep on an accelerator: `python -m benchmarks.gpu --json F`.
 
-Correctness first (torques against float64 on the host), then the controller's and the
-environment's throughput, PPO's, and one learning run. MJX physics throughout.
+Correctness first (torques against float64 on the host's CPU), then the controller's and
+the environment's throughput on MJX and, where it is installed, on Warp; then PPO's with
+one learning run each. Each part is a process; all compile at the same time and measure
+in turn, so that the sweep takes minutes. What a part finds is written at once, and one
+that fails says why and does not stop the others.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import multiprocessing
+import os
+import sys
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import (
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
+from functools import partial
 from pathlib import Path
+from threading import Barrier, Lock
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,22 +34,49 @@ import numpy as np
 
 import envs
 import rmp_mjx as rmp
-from benchmarks.common import Row, measure, show, write_json
+from benchmarks.common import Row, Timing, show, time_calls, write_json
 from rmp_mjx import runtime
 from rmp_mjx.training import evaluate
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.networks import make_agent
 from rmp_mjx.training.ppo import make_ppo
 
+ENGINES = ("mjx", "warp")
+
+Part = Callable[[], list[Row]]
+"""Measures what was compiled for it."""
+
+
+class Programs:
+    """Compiles side by side: tracing takes turns, the compiler does not."""
+
+    def __init__(self):
+        self._pool = ThreadPoolExecutor()
+
+    def add(self, function: Callable[..., Any], *args: Any) -> Future:
+        """Begin to compile; the future gives the program and its seconds.
+
+        Args:
+            function: What to jit.
+            *args: Its arguments, or their shapes.
+        """
+        start = time.perf_counter()
+        lowered = jax.jit(function).lower(*args)
+
+        def finish():
+            return lowered.compile(), time.perf_counter() - start
+
+        return self._pool.submit(finish)
+
 
 def scene(robot: rmp.Robot, batch: int):
-    """Random states near home, set-points, five spheres and the table."""
+    """Random states near home, actions, and the centres of five spheres."""
     rng = np.random.default_rng(0)
     q = robot.q_home + rng.uniform(-0.7, 0.7, (batch, robot.n))
     qd = rng.normal(size=(batch, robot.n))
     action = rng.uniform(-1.0, 1.0, (batch, rmp.ACTION_SIZE))
     centers = rng.uniform([0.2, -0.4, 0.0], [0.6, 0.4, 0.5], (5, 3))
-    return q, qd, action, centers
+    return [jnp.asarray(x, jnp.float32) for x in (q, qd, action)], centers
 
 
 def torques(ctrl: rmp.RMPVICES, centers):
@@ -48,12 +92,11 @@ def torques(ctrl: rmp.RMPVICES, centers):
 
 def correctness(robot: rmp.Robot) -> list[Row]:
     """Float32 torques on this device against float64 on the host's CPU."""
-    q, qd, action, centers = scene(robot, 1000)
-    single = [jnp.asarray(x, jnp.float32) for x in (q, qd, action)]
+    states, centers = scene(robot, 1000)
     ctrl = rmp.RMPVICES(robot)
-    tau = np.asarray(jax.jit(torques(ctrl, centers))(*single))
+    tau = np.asarray(jax.jit(torques(ctrl, centers))(*states))
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        double = [jnp.asarray(np.asarray(x), jnp.float64) for x in single]
+        double = [jnp.asarray(np.asarray(x), jnp.float64) for x in states]
         exact = np.asarray(jax.jit(torques(ctrl, centers))(*double))
     error = np.abs(tau - exact).max(axis=1) / np.abs(exact).max(axis=1)
     note = "largest joint error over the largest torque, 1,000 states, 5 spheres"
@@ -63,99 +106,193 @@ def correctness(robot: rmp.Robot) -> list[Row]:
     ]
 
 
-def controller(robot: rmp.Robot, batches: Sequence[int]) -> list[Row]:
-    """Tree evaluations per second."""
-    rows = []
-    for batch in batches:
-        q, qd, action, centers = scene(robot, batch)
-        states = [jnp.asarray(x, jnp.float32) for x in (q, qd, action)]
-        timing = measure(torques(rmp.RMPVICES(robot), centers), *states, seconds=2.0)
-        rows.append(
-            Row(
-                f"controller_evals_per_s_batch{batch}",
-                batch / timing.median,
-                "1/s",
-                f"{len(robot.points.segment)} points; {timing.spread}",
-            )
-        )
-    return rows
-
-
-def environment(name: str, batches: Sequence[int]) -> list[Row]:
-    """Policy steps per second under random actions."""
-    env = envs.load("trajectory", controller=name, physics="mjx")
-    rows = []
-    for batch in batches:
-        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch))
-        shape = (batch, env.action_size)
-        action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0)
-        timing = measure(jax.vmap(env.step), state, action, seconds=3.0)
-        rows.append(
-            Row(
-                f"env_steps_per_s_mjx_{name}_{batch}",
-                batch / timing.median,
-                "1/s",
-                f"{env.n_substeps} substeps; compile {timing.compile_s:.0f} s; "
-                + timing.spread,
-            )
-        )
-    return rows
-
-
-def learning(num_envs: int, steps: int) -> list[Row]:
-    """Train RMP-VICES on trajectory following and evaluate it."""
-    config = TrainConfig(
-        physics="mjx", num_envs=num_envs, num_timesteps=steps, num_minibatches=16
-    )
-    env = envs.load("trajectory", controller="rmp_vices", physics="mjx")
-    ppo = make_ppo(env, config)
-    state = jax.jit(ppo.init)(jax.random.key(0))
-    start = time.monotonic()
-    iterate = jax.jit(ppo.iterate).lower(state).compile()
-    compile_s = time.monotonic() - start
-    times, events = [], 0.0
-    for _ in range(config.num_iterations):
-        start = time.monotonic()
-        state, stats, _ = jax.block_until_ready(iterate(state))
-        times.append(time.monotonic() - start)
-        events += sum(float(stats.step_sums[k]) for k in ("collision", "joint_limit"))
-    agent = make_agent(ppo.networks, state.normalizer, state.learner.policy, True)
-    results = evaluate.run_episodes(env, agent, 1000, jax.random.key(1))
-    summary = evaluate.summarise(results, env.metric_reductions)
-    note = f"{num_envs} envs, {config.num_iterations} iterations, seed 0"
-    rate = config.steps_per_iteration / float(np.median(times))
-    return [
-        Row("ppo_steps_per_s_mjx", rate, "1/s", "updates included; " + note),
-        Row("ppo_compile_s", compile_s, "s", note),
-        Row("ppo_train_s", sum(times), "s", f"{steps} policy steps; " + note),
-        Row("train_events", events, "-", "collisions and joint limits; " + note),
-        Row("eval_success_rate", summary["success_rate"], "-", "1,000 episodes"),
-        Row("eval_collision_rate", summary["collision_rate"], "-", "1,000 episodes"),
-        Row("eval_limit_rate", summary["joint_limit_rate"], "-", "1,000 episodes"),
+def controller(programs: Programs, batches: Sequence[int]) -> Part:
+    """Errors of the torques, then evaluations of the tree per second."""
+    robot = rmp.Robot.load("jaco2")
+    states = {batch: scene(robot, batch)[0] for batch in batches}
+    begun = [
+        programs.add(torques(rmp.RMPVICES(robot), scene(robot, batch)[1]), *x)
+        for batch, x in states.items()
     ]
+    compiled = [program.result()[0] for program in begun]
+
+    def measured() -> list[Row]:
+        rows = correctness(robot)
+        for (batch, x), program in zip(states.items(), compiled, strict=True):
+            timing = Timing(0.0, time_calls(program, *x, seconds=2.0))
+            note = f"{len(robot.points.segment)} points, 5 spheres; "
+            note += f"{kernels(program)} kernels; {timing.spread}"
+            rate = batch / timing.median
+            rows.append(Row(f"controller_evals_per_s_{batch}", rate, "1/s", note))
+        return rows
+
+    return measured
+
+
+def kernels(compiled: Any) -> int:
+    """Fusions and other calls in a program, each a kernel on a GPU."""
+    text = compiled.as_text()
+    return sum(text.count(f" {name}(") for name in ("fusion", "custom-call"))
+
+
+def environment(
+    programs: Programs, physics: str, name: str, batches: Sequence[int]
+) -> Part:
+    """Policy steps per second under random actions."""
+    env = envs.load("trajectory", controller=name, physics=physics)
+    reset = jax.vmap(env.reset)
+    keys = jax.random.split(jax.random.key(0), max(batches))
+    actions = jax.random.uniform(
+        jax.random.key(1), (len(keys), env.action_size), minval=-1.0
+    )
+    every = programs.add(reset, keys).result()[0](keys), actions
+    inputs = {n: jax.tree.map(lambda x, n=n: x[:n], every) for n in batches}
+    begun = [programs.add(jax.vmap(env.step), *x) for x in inputs.values()]
+    compiled = [program.result() for program in begun]
+    for (step, _), x in zip(compiled, inputs.values(), strict=True):
+        jax.block_until_ready(step(*x))  # Warp compiles its kernels here
+
+    def measured() -> list[Row]:
+        rows = []
+        for (step, compile_s), (n, x) in zip(compiled, inputs.items(), strict=True):
+            timing = Timing(compile_s, time_calls(step, *x, seconds=3.0))
+            note = f"{env.n_substeps} substeps; compiled in {compile_s:.0f} s beside "
+            note += f"all others; {timing.spread}"
+            key = f"env_steps_per_s_{physics}_{name}_{n}"
+            rows.append(Row(key, n / timing.median, "1/s", note))
+        return rows
+
+    return measured
+
+
+def training(
+    programs: Programs, physics: str, num_envs: int, steps: int, episodes: int
+) -> Part:
+    """Train RMP-VICES on trajectory following; evaluate the policy if asked to."""
+    config = TrainConfig(
+        physics=physics, num_envs=num_envs, num_timesteps=steps, num_minibatches=16
+    )
+    env = envs.load("trajectory", controller="rmp_vices", physics=physics)
+    ppo, key = make_ppo(env, config), jax.random.key(0)
+
+    def play(state, key):
+        parameters = state.normalizer, state.learner.policy
+        agent = make_agent(ppo.networks, *parameters, deterministic=True)
+        return evaluate.play(env, episodes, 0, agent, key)[0]
+
+    start = programs.add(ppo.init, key).result()[0](key)
+    iterate = programs.add(ppo.iterate, start)
+    judge = programs.add(play, start, key) if episodes else None
+    step, compile_s = iterate.result()
+    jax.block_until_ready(step(start))  # Warp compiles its kernels here
+
+    def measured() -> list[Row]:
+        state, times, events = start, [], 0.0
+        for _ in range(config.num_iterations):
+            begin = time.perf_counter()
+            state, stats, _ = jax.block_until_ready(step(state))
+            times.append(time.perf_counter() - begin)
+            sums = stats.step_sums
+            events += float(sums["collision"] + sums["joint_limit"])
+        rate = config.steps_per_iteration / float(np.median(times))
+        taken = f"{config.num_iterations * config.steps_per_iteration:,} policy steps"
+        note = f"{num_envs:,} environments, seed 0"
+        rows = [
+            ("steps_per_s", rate, "1/s", f"updates included; {note}"),
+            ("compile_s", compile_s, "s", f"beside all others; {note}"),
+            ("train_s", sum(times), "s", f"{taken}; {note}"),
+            ("events", events, "-", f"collisions and joint limits, {taken}; {note}"),
+        ]
+        if judge:
+            results = jax.device_get(judge.result()[0](state, jax.random.key(1)))
+            summary = evaluate.summarise(results, env.metric_reductions)
+            judged = f"{episodes:,} episodes; {note}"
+            rows += [
+                (f"eval_{name}_rate", summary[f"{name}_rate"], "-", judged)
+                for name in ("success", "collision", "joint_limit")
+            ]
+        return [Row(f"ppo_{key}_{physics}_{num_envs}", *rest) for key, *rest in rows]
+
+    return measured
+
+
+def work(
+    part: Callable[[Programs], Part], compiled: Barrier, turn: Lock
+) -> list[Row] | str:
+    """Compile a part in a process of its own, wait for the others, measure in turn.
+
+    Returns:
+        Its rows, or why it failed.
+    """
+    runtime.configure(compile_cache=False)
+    try:
+        try:
+            measured = part(Programs())
+        finally:
+            compiled.wait()
+        with turn:
+            return measured()
+    except Exception:
+        return traceback.format_exc()
+
+
+def sweep(small: bool) -> dict[str, Callable[[Programs], Part]]:
+    """The parts by name."""
+    evaluations = [256] if small else [1, 2048, 8192, 32768]
+    sizes = [32, 64] if small else [2048, 8192, 32768]
+    *_, middle, most = sizes
+    steps, episodes = (2048, 100) if small else (8_000_000, 1000)
+    parts: dict[str, Callable[[Programs], Part]] = {
+        "controller": partial(controller, batches=evaluations)
+    }
+    for engine in ENGINES:
+        if engine == "warp" and importlib.util.find_spec("warp") is None:
+            continue
+        for name, batches in (("rmp_vices", sizes), ("vices", [middle])):
+            parts[f"{engine}, {name}"] = partial(
+                environment, physics=engine, name=name, batches=batches
+            )
+        for num_envs, taken, judged in (
+            (middle, steps, episodes),
+            (most, steps // 4, 0),
+        ):
+            parts[f"{engine}, training, {num_envs:,} environments"] = partial(
+                training,
+                physics=engine,
+                num_envs=num_envs,
+                steps=taken,
+                episodes=judged,
+            )
+    return parts
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the sweep, writing after every part."""
+    """Run the sweep, writing after every part; exit code 1 if a part failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--quick", action="store_true", help="small sizes")
     options = parser.parse_args(args)
-    runtime.configure()
-    robot = rmp.Robot.load("jaco2")
-    small = options.quick
+    begin = time.perf_counter()
+    # One process must not take the memory of the others.
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    parts = sweep(options.quick)
+    context = multiprocessing.get_context("spawn")
     rows: list[Row] = []
-    for part in (
-        lambda: correctness(robot),
-        lambda: controller(robot, [256] if small else [1, 2048, 8192, 32768]),
-        lambda: environment("rmp_vices", [64] if small else [8192]),
-        lambda: learning(64 if small else 4096, 2048 if small else 4_000_000),
-        lambda: environment("rmp_vices", [] if small else [32768, 2048]),
-        lambda: environment("vices", [] if small else [8192]),
-    ):
-        rows += part()
-        show(rows, "accelerator sweep")
-        write_json(options.json, rows, quick=small)
+    failed = 0
+    with context.Manager() as shared, ProcessPoolExecutor(len(parts), context) as pool:
+        barrier, turn = shared.Barrier(len(parts)), shared.Lock()
+        begun = {pool.submit(work, parts[k], barrier, turn): k for k in parts}
+        for done in as_completed(begun):
+            found = done.result()
+            if isinstance(found, str):
+                failed += 1
+                print(f"{begun[done]} failed:\n{found}", file=sys.stderr)
+                continue
+            rows += found
+            taken = Row("sweep_s", time.perf_counter() - begin, "s", "up to here")
+            write_json(options.json, [*rows, taken], quick=options.quick)
+    show(rows, "accelerator sweep")
+    sys.exit(bool(failed))
 
 
 if __name__ == "__main__":

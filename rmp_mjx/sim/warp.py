@@ -117,10 +117,10 @@ def _flattened(function: Callable[..., Any]) -> Callable[..., Any]:
     def rule(size: int, is_batched: Any, *args: Any) -> tuple[Any, Any]:
         def fold(x: Array, mapped: bool) -> Array:
             x = x if mapped else jnp.broadcast_to(x, (size, *x.shape))
-            return x.reshape(-1, *x.shape[2:])
+            return x.reshape(size * x.shape[1], *x.shape[2:])
 
         def unfold(x: Array) -> Array:
-            return x.reshape(size, -1, *x.shape[1:])
+            return x.reshape(size, x.shape[0] // size, *x.shape[1:])
 
         out = batched(*jax.tree.map(fold, args, tuple(is_batched)))
         return jax.tree.map(unfold, out), jax.tree.map(lambda _: True, out)

@@ -63,7 +63,7 @@ def recorder(
     env: Env, num_episodes: int, recorded: int
 ) -> Callable[[Agent, PRNGKeyArray], tuple[Episodes, Recording]]:
     """`record_episodes` for several agents; compiled once for those of one network."""
-    run = jax.jit(partial(_run, env, num_episodes, min(recorded, num_episodes)))
+    run = jax.jit(partial(play, env, num_episodes, min(recorded, num_episodes)))
     steps = min(env.episode_length, recording.MAX_STEPS)
 
     def record(agent: Agent, key: PRNGKeyArray) -> tuple[Episodes, Recording]:
@@ -91,12 +91,13 @@ class _Lanes:
     """Whether it became non-finite."""
 
 
-def _run(
+def play(
     env: Env, num: int, recorded: int, agent: Agent, key: PRNGKeyArray
 ) -> tuple[dict[str, Any], Any]:
-    """Work through the episodes; a lane whose episode has ended takes the next one.
+    """Work through episodes in lanes; what `recorder` compiles.
 
-    Lanes wait until there are enough of them for a reset to be worth its time.
+    A lane whose episode has ended takes the next one; it waits until there are enough
+    of them for a reset to be worth its time.
     """
     kinds = env.metric_reductions
     key_reset, key_act = jax.random.split(key)

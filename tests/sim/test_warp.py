@@ -62,6 +62,15 @@ def test_each_vmap_goes_into_the_leading_axis():
     assert shapes[-1] == ((6, 5), (6, 1))  # 2 x 3 worlds at once
 
 
+def test_arrays_without_entries_pass_a_vmap():
+    """A scene without spheres has no mocap bodies."""
+    function = _flattened(lambda x, empty: (x + 1.0, empty))
+    x, empty = jnp.zeros((2, 3, 1, 5)), jnp.zeros((2, 3, 1, 0, 3))
+    out, still = jax.vmap(jax.vmap(function))(x, empty)
+    np.testing.assert_array_equal(out, x + 1.0)
+    assert still.shape == empty.shape
+
+
 def test_there_is_room_for_every_contact(weights, jaco):
     # A rod touches the floor at two points, a ball anything at one; frictionless.
     contacts, rows = capacity(weights)
