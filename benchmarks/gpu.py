@@ -4,12 +4,14 @@ Correctness first (torques against float64 on the host's CPU), then the controll
 the environment's throughput on MJX and, where it is installed, on Warp; then PPO's with
 one learning run each. Each part is a process; all compile at the same time and measure
 in turn, so that the sweep takes minutes. What a part finds is written at once, and one
-that fails says why and does not stop the others.
+that fails says why and does not stop the others. `--grid` does the same for the cells
+of the paper's grid.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.util
 import multiprocessing
 import os
@@ -35,13 +37,16 @@ import numpy as np
 import envs
 import rmp_mjx as rmp
 from benchmarks.common import Row, Timing, show, time_calls, write_json
+from benchmarks.paper import tasks
+from benchmarks.paper.cells import PRESETS, Cell, Preset
 from rmp_mjx import runtime
-from rmp_mjx.training import evaluate
+from rmp_mjx.training import evaluate, seeds
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.networks import make_agent
 from rmp_mjx.training.ppo import make_ppo
 
-ENGINES = ("mjx", "warp")
+ITERATIONS = 20
+"""Iterations by which a cell of the grid is timed."""
 
 Part = Callable[[], list[Row]]
 """Measures what was compiled for it."""
@@ -216,6 +221,39 @@ def training(
     return measured
 
 
+def cell(programs: Programs, physics: str, preset: Preset, own: Cell) -> Part:
+    """All seeds of a cell of the paper's grid in one program, for some iterations."""
+    config = dataclasses.replace(
+        preset.config(own), physics=physics, num_seeds=preset.seeds
+    )
+    env = tasks.load(config)
+    ppo, keys = make_ppo(env, config), seeds.keys(config)
+    start = programs.add(jax.vmap(ppo.init), keys).result()[0](keys)
+    iterate, compile_s = programs.add(jax.vmap(ppo.iterate), start).result()
+    jax.block_until_ready(iterate(start))  # Warp compiles its kernels here
+
+    def measured() -> list[Row]:
+        state, times = start, []
+        for _ in range(min(ITERATIONS, config.num_iterations)):
+            begin = time.perf_counter()
+            state, *_ = jax.block_until_ready(iterate(state))
+            times.append(time.perf_counter() - begin)
+        seconds = float(np.median(times))
+        rate = config.num_seeds * config.steps_per_iteration / seconds
+        note = f"{config.num_seeds} seeds of {config.num_envs} environments; median of "
+        note += f"{len(times)} iterations, {min(times):.3f} to {max(times):.3f} s"
+        whole = f"{config.num_iterations} such iterations; "
+        rows = [
+            ("steps_per_s", rate, "1/s", "updates included; " + note),
+            ("compile_s", compile_s, "s", "beside all others; " + note),
+            ("train_s", seconds * config.num_iterations, "s", whole + note),
+        ]
+        name = f"{physics}_{own.task}_{own.variant}"
+        return [Row(f"grid_{key}_{name}", *rest) for key, *rest in rows]
+
+    return measured
+
+
 def work(
     part: Callable[[Programs], Part], compiled: Barrier, turn: Lock
 ) -> list[Row] | str:
@@ -236,6 +274,23 @@ def work(
         return traceback.format_exc()
 
 
+def engines() -> list[str]:
+    """Physics engines that are installed."""
+    warp = importlib.util.find_spec("warp") is not None
+    return ["mjx", "warp"] if warp else ["mjx"]
+
+
+def grid(small: bool) -> dict[str, Callable[[Programs], Part]]:
+    """The cells of the paper's grid by name."""
+    preset = PRESETS["smoke" if small else "full"]
+    return {
+        f"{engine}, {own}": partial(cell, physics=engine, preset=preset, own=own)
+        for engine in engines()
+        for own in preset.cells()
+        if own.seed == 0
+    }
+
+
 def sweep(small: bool) -> dict[str, Callable[[Programs], Part]]:
     """The parts by name."""
     evaluations = [256] if small else [1, 2048, 8192, 32768]
@@ -245,9 +300,7 @@ def sweep(small: bool) -> dict[str, Callable[[Programs], Part]]:
     parts: dict[str, Callable[[Programs], Part]] = {
         "controller": partial(controller, batches=evaluations)
     }
-    for engine in ENGINES:
-        if engine == "warp" and importlib.util.find_spec("warp") is None:
-            continue
+    for engine in engines():
         for name, batches in (("rmp_vices", sizes), ("vices", [middle])):
             parts[f"{engine}, {name}"] = partial(
                 environment, physics=engine, name=name, batches=batches
@@ -271,11 +324,14 @@ def main(args: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--quick", action="store_true", help="small sizes")
+    parser.add_argument(
+        "--grid", action="store_true", help="instead, the paper's grid, ten seeds each"
+    )
     options = parser.parse_args(args)
     begin = time.perf_counter()
     # One process must not take the memory of the others.
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-    parts = sweep(options.quick)
+    parts = (grid if options.grid else sweep)(options.quick)
     context = multiprocessing.get_context("spawn")
     rows: list[Row] = []
     failed = 0

@@ -45,7 +45,7 @@ class WarpPhysics:
         self.model = model
         self._contacts, self._rows = capacity(model)
         try:
-            self._mjx_model = mjx.put_model(model, impl="warp")
+            self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
         except NotImplementedError as error:
             raise PhysicsError(f"Warp cannot simulate this model: {error}") from error
         self._templates: dict[int, Any] = {}
@@ -97,6 +97,16 @@ class WarpPhysics:
                     njmax=self._rows,
                 )
         return self._templates[worlds]
+
+
+def _quiet(model: mjx.Model) -> mjx.Model:
+    """Do not print where the solver uses all iterations it has, as no engine does."""
+    from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+    told = model.opt._impl.warn_overflow
+    told &= ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
+    quiet: Any = model.tree_replace({"opt._impl.warn_overflow": int(told)})
+    return quiet
 
 
 def capacity(model: mujoco.MjModel) -> tuple[int, int]:
