@@ -181,12 +181,12 @@ def _inflate(
     )
     norm = jnp.sqrt(g @ g)
     normal = Vec(g.x / norm, g.y / norm, g.z / norm)
-    rate = normal @ gdot
-    curvature = jnp.where(touching, 0.0, (gdot @ gdot - rate * rate) / norm)
+    rate = (g @ gdot) / norm
+    turning = jnp.where(touching, 0.0, gdot @ gdot - rate * rate)
     if coriolis is not None:
-        curvature = curvature + normal @ coriolis
+        turning = turning + g @ coriolis
     distance = jnp.where(touching, 0.0, norm) - radius
-    return Gap(distance, rate, normal, curvature, active)
+    return Gap(distance, rate, normal, turning / norm, active)
 
 
 def _avoided(kind: Spheres | Planes | Capsules | Boxes, hand: np.ndarray) -> Array:

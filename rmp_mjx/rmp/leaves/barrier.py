@@ -74,11 +74,11 @@ class Barrier(ScalarLeaf):
         v = jnp.where(active, jnp.minimum(xd, 0.0), 0.0)
         hold = jnp.where(active, jnp.exp(-jnp.maximum(xd, 0.0) / self.v_out), 0.0)
         fade = 1.0 - gap / self.r
-        # Ends in a division: XLA's CPU backend stores its result for all who need it,
-        # where it would compute what ends in a product again for each of them. The
-        # bounds keep far gaps and infinite caps finite in float32.
+        # Both end in a division: XLA's CPU backend stores its result for all who need
+        # it, where it would compute what ends in a product again for each of them.
+        # The bounds keep far gaps and infinite caps finite in float32.
         gap4 = jnp.minimum(gap, 1e3) ** 4
         m = self.mu * fade**2 * (v * v + self.eps)
         m = hold * jnp.minimum(m, jnp.minimum(self.cap, 1e25) * gap4) / gap4
-        a = -self.eta * v + v * v / gap + self.k_out * depth
-        return m * a, m
+        pull = v * v + gap * (self.k_out * depth - self.eta * v)
+        return m * pull / gap, m
