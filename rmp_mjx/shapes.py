@@ -150,7 +150,9 @@ class Boxes:
         axes = [Vec.column(self.rotation[:, :, i]) for i in range(3)]
         half = Vec.column(self.half_size)
         r, rel, coriolis = _ride_along(self, x, v)
-        local, local_v = (Vec(*(a @ w for a in axes)) for w in (r, rel))
+        local, local_v, local_c = (
+            Vec(*(a @ w for a in axes)) for w in (r, rel, coriolis)
+        )
         over = local.map(lambda c, h: jnp.abs(c) - h, half)
         depth = jnp.maximum(jnp.maximum(over.x, over.y), over.z)
         inside = depth <= 0.0
@@ -163,12 +165,13 @@ class Boxes:
         sign = local.map(lambda c: jnp.where(c < 0.0, -1.0, 1.0))
         local_g = free.map(lambda f, s, o: jnp.where(f, s * o, 0.0), sign, reach)
         local_gdot = free.map(lambda f, c: jnp.where(f, c, 0.0), local_v)
-        g, gdot = (
-            axes[0] * w.x + axes[1] * w.y + axes[2] * w.z for w in (local_g, local_gdot)
-        )
         radius = self.radius[:, None] + rho
-        gap = _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
-        return gap._replace(distance=jnp.where(inside, depth - radius, gap.distance))
+        gap = _inflate(local_g, local_gdot, radius, _avoided(self, hand), local_c)
+        n = gap.normal
+        return gap._replace(
+            normal=axes[0] * n.x + axes[1] * n.y + axes[2] * n.z,
+            distance=jnp.where(inside, depth - radius, gap.distance),
+        )
 
 
 def _inflate(
