@@ -123,10 +123,7 @@ def add_pairs(
 
 def read_contacts(model: mujoco.MjModel, state: PhysicsState) -> Contacts:
     """Contacts of the watched pairs, in the order given to `add_pairs`."""
-    address = _address(model).reshape(-1)
-    runs = np.split(address, np.flatnonzero(np.diff(address) != 1) + 1)
-    # Slices: on a CPU, XLA reads what is gathered number by number.
-    rows = jnp.concatenate([state.sensors[run[0] : run[-1] + 1] for run in runs])
+    rows = _take(state.sensors, _address(model).reshape(-1))
     rows = rows.reshape(-1, CONTACTS_PER_PAIR, _WIDTH)
     touching = (rows[..., 0] > 0) & (rows[..., 4] < 0)
     return Contacts(
@@ -160,6 +157,14 @@ def pair_sensors(model: mujoco.MjModel) -> list[int]:
     """Ids of the sensors that `add_pairs` made, in order."""
     names = (model.sensor(s).name for s in range(model.nsensor))
     return [s for s, name in enumerate(names) if name.startswith(PAIR_SENSOR)]
+
+
+def _take(x: Array, index: np.ndarray) -> Array:
+    """x[index] by slices: XLA's CPU backend reads what is gathered one by one."""
+    if not index.size:
+        return x[:0]
+    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
+    return jnp.concatenate([x[run[0] : run[-1] + 1] for run in runs])
 
 
 def _address(model: mujoco.MjModel) -> np.ndarray:

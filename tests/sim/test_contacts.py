@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rmp_mjx.sim import load_physics, read_contacts
+from rmp_mjx.sim.base import _take
 
 G = 9.81
 ROD, TARGET, BALL = range(3)  # the order of the pairs in conftest.py
@@ -50,6 +51,12 @@ def test_what_is_lifted_off_touches_nothing(settled):
     contacts, state = settled
     assert np.all(state.qpos[2] > 0.5)
     assert not np.any(contacts.touching[2])
+
+
+@pytest.mark.parametrize("index", [[], [3, 4, 5], [0, 1, 6, 7, 2]])
+def test_what_is_read_by_slices_is_what_is_indexed(index):
+    x, index = jnp.arange(8.0), np.array(index, int)
+    np.testing.assert_array_equal(_take(x, index), x[index])
 
 
 def test_pairs_that_are_not_watched_do_not_collide(weights):
