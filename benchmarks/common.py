@@ -25,7 +25,16 @@ from rmp_mjx import runtime
 from rmp_mjx.training import devices
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("rmp-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "numpy")
+PACKAGES = (
+    "rmp-mjx",
+    "jax",
+    "jaxlib",
+    "mujoco",
+    "mujoco-mjx",
+    "warp-lang",
+    "brax",
+    "numpy",
+)
 DEFAULT_FLAGS_SUFFIX = "_default_flags"
 
 

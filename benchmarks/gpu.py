@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.util
 import multiprocessing
 import os
 import sys
@@ -39,7 +38,8 @@ import rmp_mjx as rmp
 from benchmarks.common import Row, Timing, show, time_calls, write_json
 from benchmarks.paper import tasks
 from benchmarks.paper.cells import PRESETS, Cell, Preset
-from rmp_mjx import runtime
+from envs.scene import TABLE_HEIGHT
+from rmp_mjx import runtime, sim
 from rmp_mjx.training import evaluate, seeds
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.networks import make_agent
@@ -87,7 +87,7 @@ def scene(robot: rmp.Robot, batch: int):
 def torques(ctrl: rmp.RMPVICES, centers):
     """The batched controller from states and policy actions."""
     obstacles = rmp.Obstacles.empty(spheres=5, planes=1).with_spheres(centers, 0.05)
-    obstacles = obstacles.with_planes([[0.0, 0.0, -0.112]], [[0.0, 0.0, 1.0]])
+    obstacles = obstacles.with_planes([[0.0, 0.0, TABLE_HEIGHT]], [[0.0, 0.0, 1.0]])
 
     def act(q, qd, action):
         return ctrl(q, qd, ctrl.setpoint(q, ctrl.decode(action)), obstacles).tau
@@ -114,16 +114,13 @@ def correctness(robot: rmp.Robot) -> list[Row]:
 def controller(programs: Programs, batches: Sequence[int]) -> Part:
     """Errors of the torques, then evaluations of the tree per second."""
     robot = rmp.Robot.load("jaco2")
-    states = {batch: scene(robot, batch)[0] for batch in batches}
-    begun = [
-        programs.add(torques(rmp.RMPVICES(robot), scene(robot, batch)[1]), *x)
-        for batch, x in states.items()
-    ]
+    ctrl, scenes = rmp.RMPVICES(robot), [scene(robot, batch) for batch in batches]
+    begun = [programs.add(torques(ctrl, centers), *x) for x, centers in scenes]
     compiled = [program.result()[0] for program in begun]
 
     def measured() -> list[Row]:
         rows = correctness(robot)
-        for (batch, x), program in zip(states.items(), compiled, strict=True):
+        for batch, (x, _), program in zip(batches, scenes, compiled, strict=True):
             timing = Timing(0.0, time_calls(program, *x, seconds=2.0))
             note = f"{len(robot.points.segment)} points, 5 spheres; "
             note += f"{kernels(program)} kernels; {timing.spread}"
@@ -170,6 +167,19 @@ def environment(
     return measured
 
 
+def iterate(
+    step: Callable[[Any], Any], state: Any, count: int
+) -> tuple[Any, list[Any], list[float]]:
+    """So many iterations of PPO: the last state, their statistics, their seconds."""
+    stats, times = [], []
+    for _ in range(count):
+        begin = time.perf_counter()
+        state, found, _ = jax.block_until_ready(step(state))
+        times.append(time.perf_counter() - begin)
+        stats.append(found)
+    return state, stats, times
+
+
 def training(
     programs: Programs, physics: str, num_envs: int, steps: int, episodes: int
 ) -> Part:
@@ -186,19 +196,15 @@ def training(
         return evaluate.play(env, episodes, 0, agent, key)[0]
 
     start = programs.add(ppo.init, key).result()[0](key)
-    iterate = programs.add(ppo.iterate, start)
+    trainer = programs.add(ppo.iterate, start)
     judge = programs.add(play, start, key) if episodes else None
-    step, compile_s = iterate.result()
+    step, compile_s = trainer.result()
     jax.block_until_ready(step(start))  # Warp compiles its kernels here
 
     def measured() -> list[Row]:
-        state, times, events = start, [], 0.0
-        for _ in range(config.num_iterations):
-            begin = time.perf_counter()
-            state, stats, _ = jax.block_until_ready(step(state))
-            times.append(time.perf_counter() - begin)
-            sums = stats.step_sums
-            events += float(sums["collision"] + sums["joint_limit"])
+        state, stats, times = iterate(step, start, config.num_iterations)
+        sums = [found.step_sums for found in stats]
+        events = sum(float(one["collision"] + one["joint_limit"]) for one in sums)
         rate = config.steps_per_iteration / float(np.median(times))
         taken = f"{config.num_iterations * config.steps_per_iteration:,} policy steps"
         note = f"{num_envs:,} environments, seed 0"
@@ -229,15 +235,12 @@ def cell(programs: Programs, physics: str, preset: Preset, own: Cell) -> Part:
     env = tasks.load(config)
     ppo, keys = make_ppo(env, config), seeds.keys(config)
     start = programs.add(jax.vmap(ppo.init), keys).result()[0](keys)
-    iterate, compile_s = programs.add(jax.vmap(ppo.iterate), start).result()
-    jax.block_until_ready(iterate(start))  # Warp compiles its kernels here
+    step, compile_s = programs.add(jax.vmap(ppo.iterate), start).result()
+    jax.block_until_ready(step(start))  # Warp compiles its kernels here
 
     def measured() -> list[Row]:
-        state, times = start, []
-        for _ in range(min(ITERATIONS, config.num_iterations)):
-            begin = time.perf_counter()
-            state, *_ = jax.block_until_ready(iterate(state))
-            times.append(time.perf_counter() - begin)
+        count = min(ITERATIONS, config.num_iterations)
+        *_, times = iterate(step, start, count)
         seconds = float(np.median(times))
         rate = config.num_seeds * config.steps_per_iteration / seconds
         note = f"{config.num_seeds} seeds of {config.num_envs} environments; median of "
@@ -275,9 +278,12 @@ def work(
 
 
 def engines() -> list[str]:
-    """Physics engines that are installed."""
-    warp = importlib.util.find_spec("warp") is not None
-    return ["mjx", "warp"] if warp else ["mjx"]
+    """Physics engines for an accelerator that are installed."""
+    try:
+        sim.require("warp")
+    except sim.PhysicsError:
+        return ["mjx"]
+    return ["mjx", "warp"]
 
 
 def grid(small: bool) -> dict[str, Callable[[Programs], Part]]:

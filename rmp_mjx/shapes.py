@@ -177,7 +177,10 @@ class Boxes:
 def _inflate(
     g: Vec, gdot: Vec, radius: Array, active: Array, coriolis: Vec | None = None
 ) -> Gap:
-    """Gap to a core inflated by a radius, from the vector off the core and its rate."""
+    """Gap to a core inflated by a radius, from the vector off the core and its rate.
+
+    Normal, rate and curvature end in divisions, which XLA stores: see `Barrier.scalar`.
+    """
     touching = g @ g <= TINY**2
     g = Vec(
         *(jnp.where(touching, up, c) for up, c in zip((0, 0, 1), xyz(g), strict=True))
