@@ -9,11 +9,14 @@ import jax
 from rich.console import Console
 
 import envs
+from envs import cli
 from rmp_mjx import runtime, sim
-from rmp_mjx.training import cli, evaluate, film, networks, report, run_folder
-from rmp_mjx.training.checkpoint import CheckpointError
 from rmp_mjx.training.config import validate
-from rmp_mjx.training.train import load_agent
+from rmp_mjx.training.evaluation import evaluate, film, report
+from rmp_mjx.training.learning import networks
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.checkpoint import CheckpointError
+from rmp_mjx.training.runs.loop import load_agent
 
 
 def engine(env: envs.ArmEnv) -> str:

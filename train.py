@@ -9,23 +9,15 @@ import polars as pl
 from rich.console import Console
 
 import envs
+from envs import cli, grid
 from eval import engine
 from rmp_mjx import runtime, sim
-from rmp_mjx.training import (
-    cli,
-    distributed,
-    evaluate,
-    figures,
-    film,
-    grid,
-    metrics,
-    report,
-    run_folder,
-    seeds,
-)
-from rmp_mjx.training.checkpoint import CheckpointError
 from rmp_mjx.training.config import ConfigError, TrainConfig, validate
-from rmp_mjx.training.train import TrainingFailure, train
+from rmp_mjx.training.evaluation import evaluate, figures, film, report
+from rmp_mjx.training.learning import seeds
+from rmp_mjx.training.runs import distributed, metrics, run_folder
+from rmp_mjx.training.runs.checkpoint import CheckpointError
+from rmp_mjx.training.runs.loop import TrainingFailure, train
 
 
 def finish(env, agent, config: TrainConfig, folder, console: Console) -> None:

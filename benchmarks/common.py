@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rmp_mjx import runtime
-from rmp_mjx.training import devices
+from rmp_mjx.training.learning import devices
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (

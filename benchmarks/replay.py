@@ -22,9 +22,9 @@ from rich.table import Table
 
 import envs
 from rmp_mjx import runtime
-from rmp_mjx.training import faults
 from rmp_mjx.training.config import config_of
-from rmp_mjx.training.rollout import VALUE_LIMIT
+from rmp_mjx.training.learning import faults
+from rmp_mjx.training.learning.rollout import VALUE_LIMIT
 
 SPEED_LIMIT = 1e3
 """Joint speeds beyond this count as bad; so they do in the tasks [rad/s]."""
@@ -103,7 +103,7 @@ def policy_step(
         simulated.mocap_pos[:] = centers
         simulated.ctrl[:] = out.tau
         mujoco.mj_step(model, simulated)
-        data = data.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        data = data.replace(
             qpos=jnp.asarray(simulated.qpos, data.qpos.dtype),
             qvel=jnp.asarray(simulated.qvel, data.qvel.dtype),
             warmstart=jnp.asarray(simulated.qacc_warmstart, data.qpos.dtype),

@@ -25,10 +25,11 @@ import polars as pl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from rmp_mjx.training import run_folder, seeds
 from rmp_mjx.training.config import RESUMABLE, TrainConfig, load_config
-from rmp_mjx.training.figures import curves
-from rmp_mjx.training.metrics import SEED, over_seeds
+from rmp_mjx.training.evaluation.figures import curves
+from rmp_mjx.training.learning import seeds
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.metrics import SEED, over_seeds
 from rmp_mjx.training.stats import bootstrap_mean, clopper_pearson
 
 COLORS = ("#2a6fbb", "#c0504d", "#d9a13b", "#4f9d69", "#7d5ba6", "#5b5b5b")

@@ -11,7 +11,7 @@ from envs.door import Door
 from envs.push import Push
 from envs.trajectory import Trajectory
 from envs.types import State as State
-from rmp_mjx.robot.mjcf import unknown
+from rmp_mjx.names import unknown
 
 ENVS: dict[str, type[ArmEnv]] = {task.name: task for task in (Trajectory, Door, Push)}
 """Tasks by name."""

@@ -68,7 +68,7 @@ class ArmEnv(abc.ABC):
         if robot is None:
             # The posture leaf rests where the task starts.
             robot = Robot.load("jaco2", armature=asked.armature)
-            robot = robot.replace(q_home=self.q_start)  # pyright: ignore[reportAttributeAccessIssue]
+            robot = robot.replace(q_home=self.q_start)
         controller = asked.controller
         if isinstance(controller, str):
             controller = options.CONTROLLERS[controller](robot)
@@ -214,7 +214,7 @@ class ArmEnv(abc.ABC):
             "nonfinite": bad,
         }
         metrics |= score.metrics
-        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return state.replace(
             data=data,
             obs=jnp.where(bad, 0.0, obs),
             reward=jnp.where(bad, 0.0, reward),
@@ -262,7 +262,7 @@ class ArmEnv(abc.ABC):
         """Hold one action for a policy step; the tree runs at every physics step."""
         ctrl, n = self.controller, self.robot.n
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
-        setpoint = setpoint.replace(time=jnp.asarray(time, jnp.float32))  # pyright: ignore[reportAttributeAccessIssue]
+        setpoint = setpoint.replace(time=jnp.asarray(time, jnp.float32))
 
         def substep(carry, _):
             data, spheres, torques, motion, record = carry

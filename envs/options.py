@@ -12,8 +12,8 @@ from envs.placement import LAYOUTS
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.osc import OSC
+from rmp_mjx.names import unknown
 from rmp_mjx.robot import Robot
-from rmp_mjx.robot.mjcf import unknown
 
 CONTROLLERS = {
     "rmp_vices": RMPVICES,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from envs.scene import Scene
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim import PhysicsState, read_contacts
 
@@ -42,8 +42,7 @@ NUMBERS = (
 """Its numbers."""
 
 
-@struct.dataclass
-class SafetyRecord:
+class SafetyRecord(Pytree):
     """What happened during one policy step (or one physics step)."""
 
     collision: Bool[Array, ""]
@@ -112,8 +111,7 @@ class SafetyRecord:
         )
 
 
-@struct.dataclass
-class Torques:
+class Torques(Pytree):
     """Torques of the last physics steps: what their smoothness is read from."""
 
     tau: Float[Array, " n"]
@@ -139,8 +137,7 @@ class Torques:
         return Torques(tau, change, jnp.any(turned & large), jnp.zeros((), bool))
 
 
-@struct.dataclass
-class Motion:
+class Motion(Pytree):
     """Velocities of the last physics steps: what the joints' jerk is read from."""
 
     qd: Float[Array, " n"]

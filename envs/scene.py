@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim import add_pairs
 
@@ -21,8 +22,7 @@ ARM = "arm/"
 """Prefix of the arm's names in a scene."""
 
 
-@struct.dataclass
-class Contacts:
+class Contacts(Pytree):
     """Geoms of a task's objects that take part in contact, by name (all static)."""
 
     fixtures: tuple[str, ...] = struct.field(pytree_node=False, default=())
@@ -37,8 +37,7 @@ class Contacts:
     """Contacts without the arm: two geoms and their sliding friction."""
 
 
-@struct.dataclass
-class Scene:
+class Scene(Pytree):
     """A compiled scene and what its watched contact pairs mean (all static)."""
 
     model: mujoco.MjModel = struct.field(pytree_node=False)

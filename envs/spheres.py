@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.types import Constant
 
 AWAY = (0.0, 0.0, -5.0)
 """Where a sphere waits that found no place [m]."""
 
 
-@struct.dataclass
-class Spheres:
+class Spheres(Pytree):
     """What the physics does not carry of the spheres."""
 
     placed: Bool[Array, " k"]
@@ -68,6 +67,4 @@ class Spheres:
         seen = centers - delay * self.velocity + error
         radii = jnp.full(self.placed.shape, radius)
         slots = slots.with_spheres(seen, radii, self.velocity)
-        return slots.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            spheres=slots.spheres.replace(active=self.placed)
-        )
+        return slots.replace(spheres=slots.spheres.replace(active=self.placed))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from flax import struct
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.sim import PhysicsState
 
 METRICS = {
@@ -70,8 +70,7 @@ ARM_ENTRIES = (
 """What every observation begins with."""
 
 
-@struct.dataclass
-class State:
+class State(Pytree):
     """State of one environment (the Brax and Playground convention)."""
 
     data: PhysicsState

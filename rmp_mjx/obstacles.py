@@ -5,16 +5,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 from jaxtyping import ArrayLike
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.shapes import KINDS, TINY, Boxes, Capsules, Gap, Planes, Spheres
 from rmp_mjx.vec import Vec
 
 
-@struct.dataclass
-class Obstacles:
+class Obstacles(Pytree):
     """All obstacles of a scene. Slots are padded: shapes never change, only contents.
 
     Build with `empty`, then fill with the `with_...` methods, which return copies and
@@ -102,7 +101,7 @@ class Obstacles:
             ValueError: More than the slots there are, or a radius that is not positive.
         """
         _check_positive("sphere radii", radii)
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(
             spheres=_fill(
                 self.spheres,
                 center=centers,
@@ -118,7 +117,7 @@ class Obstacles:
         """Use the first k plane slots: a point (k, 3) on each and its normal (k, 3)."""
         normals = jnp.asarray(normals, float)
         unit = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(
             planes=_fill(
                 self.planes,
                 point=points,
@@ -143,7 +142,7 @@ class Obstacles:
         length = jnp.linalg.norm(ends - starts, axis=-1)
         axis = (ends - starts) / jnp.maximum(length, TINY)[..., None]
         up = jnp.array([0.0, 0.0, 1.0])
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(
             capsules=_fill(
                 self.capsules,
                 center=0.5 * (starts + ends),
@@ -183,7 +182,7 @@ class Obstacles:
         _check_positive("box half sizes", half_sizes)
         if rotations is None:
             rotations = jnp.tile(jnp.eye(3), (np.shape(centers)[0], 1, 1))
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(
             boxes=_fill(
                 self.boxes,
                 center=centers,

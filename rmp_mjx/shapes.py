@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 from jaxtyping import Bool, Float
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.vec import Vec, xyz
 
 TINY = 1e-9
@@ -43,8 +43,7 @@ class Gap(NamedTuple):
     """Whether the control point has to keep off, (o, p)."""
 
 
-@struct.dataclass
-class Spheres:
+class Spheres(Pytree):
     """Balls."""
 
     center: Float[Array, "o 3"]
@@ -65,8 +64,7 @@ class Spheres:
         return _inflate(g, gdot, self.radius[:, None] + rho, _avoided(self, hand))
 
 
-@struct.dataclass
-class Planes:
+class Planes(Pytree):
     """Half-spaces."""
 
     point: Float[Array, "o 3"]
@@ -88,8 +86,7 @@ class Planes:
         return Gap(distance, rate, n, jnp.zeros_like(rate), _avoided(self, hand))
 
 
-@struct.dataclass
-class Capsules:
+class Capsules(Pytree):
     """Segments inflated by a radius."""
 
     center: Float[Array, "o 3"]
@@ -121,8 +118,7 @@ class Capsules:
         return _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
 
 
-@struct.dataclass
-class Boxes:
+class Boxes(Pytree):
     """Boxes with rounded edges: a box core inflated by a radius."""
 
     center: Float[Array, "o 3"]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float
+
+from rmp_mjx.pytree import Pytree
 
 # Constants are float64 NumPy arrays until traced, so that they serve any precision.
 if TYPE_CHECKING:
@@ -15,8 +16,7 @@ else:
     Constant = Array | np.ndarray
 
 
-@struct.dataclass
-class Action:
+class Action(Pytree):
     """One variable-impedance action in physical units (VICES action space)."""
 
     dpos: Float[Array, " 3"]
@@ -29,8 +29,7 @@ class Action:
     """Mass-normalised rotational stiffness per world axis [1/s^2]."""
 
 
-@struct.dataclass
-class Setpoint:
+class Setpoint(Pytree):
     """Impedance target of the end effector, held between two policy steps."""
 
     p_des: Float[Array, " 3"]
@@ -45,8 +44,7 @@ class Setpoint:
     """Time of the policy step [s]: what a controller that stirs goes by."""
 
 
-@struct.dataclass
-class ControlOutput:
+class ControlOutput(Pytree):
     """What a controller answers for one state."""
 
     tau: Float[Array, " n"]

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import Array
 
+from rmp_mjx.pytree import Pytree
 
-@struct.dataclass
-class Vec:
+
+class Vec(Pytree):
     """A 3-vector field; the components have one shape, or broadcast."""
 
     x: Array
@@ -78,19 +77,3 @@ class Vec:
 def xyz(v: Vec) -> tuple[Array, Array, Array]:
     """The components, to unpack or to iterate over."""
     return v.x, v.y, v.z
-
-
-def store(x: Array) -> Array:
-    """The same array, computed once and stored instead of recomputed by its users.
-
-    XLA's CPU backend fuses whatever leads to a small matrix into every element of
-    every consumer, and drops `optimization_barrier` before it fuses. A reduction of
-    two operands ends the fusion and is not simplified away.
-    """
-    padded = jnp.stack([x, jnp.zeros_like(x)])
-    zero = jnp.zeros((), x.dtype)
-
-    def add(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-        return a[0] + b[0], a[1] + b[1]
-
-    return jax.lax.reduce((padded, padded), (zero, zero), add, (0,))[0]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import envs
-from rmp_mjx.training import run_folder
 from rmp_mjx.training.config import load_config
-from rmp_mjx.training.train import load_agent
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.loop import load_agent
 
 FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
 

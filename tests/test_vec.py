@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rmp_mjx.vec import Vec, store
+from rmp_mjx.vec import Vec
+from rmp_mjx.xla import materialize
 
 RNG = np.random.default_rng(0)
 A, B = (RNG.normal(size=(5, 3)).astype(np.float32) for _ in range(2))
@@ -40,7 +41,7 @@ def test_stack_broadcasts_components():
 
 
 def test_stored_array_is_the_same_array_with_the_same_gradient():
-    np.testing.assert_array_equal(store(jnp.asarray(A)), A)
-    gradient = jax.grad(lambda x: jnp.sum(store(x) * B))(jnp.asarray(A))
+    np.testing.assert_array_equal(materialize(jnp.asarray(A)), A)
+    gradient = jax.grad(lambda x: jnp.sum(materialize(x) * B))(jnp.asarray(A))
     np.testing.assert_array_equal(gradient, B)
     assert jax.vmap(store)(jnp.asarray(A)).shape == A.shape

@@ -13,8 +13,8 @@ from rich.console import Console
 from benchmarks.paper import cells, report, work
 from benchmarks.paper.cells import PRESETS, Cell
 from benchmarks.paper.store import Store
+from envs import cli
 from rmp_mjx import runtime
-from rmp_mjx.training import cli
 from rmp_mjx.training.config import ConfigError
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rmp_mjx.training.cli import REFERENCE
+from envs.cli import REFERENCE
 
 
 @dataclass(frozen=True)

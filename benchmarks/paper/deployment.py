@@ -18,9 +18,9 @@ from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.columns import COLUMNS, PICTURED, TABLE, Column
 from benchmarks.paper.store import Store
 from benchmarks.paper.training import run_of
-from rmp_mjx.training import evaluate
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.train import load_agent
+from rmp_mjx.training.evaluation import evaluate
+from rmp_mjx.training.runs.loop import load_agent
 
 STARTS = 2000
 """Seed of the episodes: the same in every cell, so that all meet the same worlds."""

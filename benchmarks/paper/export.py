@@ -18,12 +18,14 @@ from typing import Annotated
 import tyro
 
 from benchmarks.paper import tasks
+from envs import cli
 from rmp_mjx import runtime
-from rmp_mjx.training import cli, run_folder, seeds
-from rmp_mjx.training.checkpoint import Checkpointer, CheckpointError
 from rmp_mjx.training.config import ConfigError, TrainConfig, load_config, save_config
-from rmp_mjx.training.ppo import TrainState, make_ppo
-from rmp_mjx.training.rollout import Env
+from rmp_mjx.training.learning import seeds
+from rmp_mjx.training.learning.ppo import TrainState, make_ppo
+from rmp_mjx.training.learning.rollout import Env
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.checkpoint import Checkpointer, CheckpointError
 
 
 @dataclass(frozen=True)

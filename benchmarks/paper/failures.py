@@ -10,8 +10,8 @@ import polars as pl
 
 from envs.base import ArmEnv
 from rmp_mjx.sim.base import pair_sensors
-from rmp_mjx.training.evaluate import Episodes
-from rmp_mjx.training.recording import MAX_STEPS, Recording
+from rmp_mjx.training.evaluation.evaluate import Episodes
+from rmp_mjx.training.evaluation.recording import MAX_STEPS, Recording
 
 SCHEMA = {
     "episode": pl.Int64,

@@ -12,8 +12,8 @@ from rich.console import Console
 from benchmarks.paper.cells import Cell
 from benchmarks.paper.store import Store
 from rmp_mjx import runtime
-from rmp_mjx.training import film
-from rmp_mjx.training.recording import Recording
+from rmp_mjx.training.evaluation import film
+from rmp_mjx.training.evaluation.recording import Recording
 
 INSTANCE, STORYBOARD = "instance.png", "storyboard.png"
 FAILURES = 3

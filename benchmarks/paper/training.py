@@ -13,15 +13,15 @@ from rich.console import Console
 from benchmarks.paper import cells, store, tasks
 from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.store import Store
-from rmp_mjx.training import run_folder
-from rmp_mjx.training.checkpoint import CheckpointError
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
     differing_fields,
     load_config,
 )
-from rmp_mjx.training.train import train
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.checkpoint import CheckpointError
+from rmp_mjx.training.runs.loop import train
 
 
 def run_of(place: Store, cell: Cell) -> Path:

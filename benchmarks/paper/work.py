@@ -19,8 +19,8 @@ from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.deployment import deploy, is_deployed
 from benchmarks.paper.store import Store
 from benchmarks.paper.training import check, is_trained, train_cell
-from rmp_mjx.training.checkpoint import CheckpointError
-from rmp_mjx.training.stopping import StopRequest, TrainingFailure
+from rmp_mjx.training.runs.checkpoint import CheckpointError
+from rmp_mjx.training.runs.stopping import StopRequest, TrainingFailure
 
 
 @dataclass(frozen=True)

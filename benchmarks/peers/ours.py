@@ -17,14 +17,14 @@ from mujoco import mjx
 
 import envs
 import rmp_mjx as rmp
-from benchmarks.bench_controller import BATCH, random_states
 from benchmarks.common import on_all_devices
 from benchmarks.peers.point_mass import ACTION_SIZE, OBSERVATION_SIZE, SETTINGS, Point
 from benchmarks.peers.problem import controller
 from benchmarks.peers.worker import Measure, latency, rate, serve
+from benchmarks.speed.bench_controller import BATCH, random_states
 from rmp_mjx import runtime
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.ppo import make_ppo
+from rmp_mjx.training.learning.ppo import make_ppo
 
 DOORS = {"mujoco": 1024, "mjx": 256}
 """Environments in a batch, by physics engine."""

@@ -9,7 +9,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+
+from rmp_mjx.pytree import Pytree
 
 OBSERVATION_SIZE = 34
 """As many as the trajectory task's."""
@@ -31,8 +32,7 @@ SETTINGS: dict[str, Any] = {
 """Of both trainers."""
 
 
-@struct.dataclass
-class Point:
+class Point(Pytree):
     """Position and velocity, observed with zeros besides; the goal is the origin."""
 
     pipeline_state: jax.Array
@@ -54,9 +54,7 @@ class Point:
         v = self.pipeline_state[1] + 0.05 * action[:3]
         x = jnp.stack([self.pipeline_state[0] + 0.05 * v, v])
         reward = -jnp.sum(x[0] ** 2)
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            pipeline_state=x, obs=_observe(x), reward=reward
-        )
+        return self.replace(pipeline_state=x, obs=_observe(x), reward=reward)
 
 
 def _observe(x: jax.Array) -> jax.Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rmp_mjx as rmp
-from benchmarks.bench_controller import BATCH, random_states
+from benchmarks.speed.bench_controller import BATCH, random_states
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 

@@ -10,11 +10,11 @@ import jax
 
 import envs
 import rmp_mjx as rmp
-from benchmarks.bench_controller import BATCH
-from benchmarks.bench_training import iterations
 from benchmarks.common import on_all_devices
 from benchmarks.peers.ours import torques
 from benchmarks.peers.worker import Measure, rate, serve
+from benchmarks.speed.bench_controller import BATCH
+from benchmarks.speed.bench_training import iterations
 from rmp_mjx import runtime
 from rmp_mjx.training.config import TrainConfig
 

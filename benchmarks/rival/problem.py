@@ -12,8 +12,8 @@ import numpy as np
 
 import envs
 import rmp_mjx as rmp
-from benchmarks.bench_controller import BATCH, random_states
 from benchmarks.peers.problem import BARRIER, double
+from benchmarks.speed.bench_controller import BATCH, random_states
 from envs.scene import ARM, TABLE_HEIGHT
 
 SCENE, ARRAYS = "scene.mjb", "arrays.npz"

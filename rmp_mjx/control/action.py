@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.math import exp_so3
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.types import Action, Setpoint
 
 ACTION_SIZE = 12
 """dpos (3), drot (3), kp_pos (3), kp_ori (3), in this order."""
 
 
-@struct.dataclass
-class ActionRange:
+class ActionRange(Pytree):
     """What -1 and 1 mean. Stiffness is spaced logarithmically."""
 
     dpos: Float[Array, ""] | float = 0.05

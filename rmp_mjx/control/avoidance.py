@@ -21,7 +21,8 @@ from rmp_mjx.robot.kinematics import (
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
 from rmp_mjx.shapes import Gap
-from rmp_mjx.vec import Vec, store
+from rmp_mjx.vec import Vec
+from rmp_mjx.xla import materialize
 
 CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]
 """A leaf for all obstacles, or one for each kind by name (None: not avoided)."""
@@ -96,7 +97,7 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
         return RMP.zero(robot.n, arm.p.dtype)
     distance, rate, curvature, rows = self_gaps(robot, arm)
     f, m = leaf.scalar(distance, rate)
-    f, m, rows = store(f - m * curvature), store(m), store(rows)
+    f, m, rows = materialize(f - m * curvature), materialize(m), materialize(rows)
     return RMP(
         f=jnp.sum(rows * f[:, None], axis=0),
         M=jnp.sum((rows * m[:, None])[:, :, None] * rows[:, None, :], axis=0),

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
@@ -48,7 +47,6 @@ class Barriers(NamedTuple):
     """Whether it counts."""
 
 
-@struct.dataclass
 class FilteredVICES(VICES):
     r"""The acceleration that VICES' torques give, changed as little as safety needs.
 

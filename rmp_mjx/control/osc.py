@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.control.vices import VICES
 from rmp_mjx.types import Action
 
 
-@struct.dataclass
 class OSC(VICES):
     """VICES whose policy moves the set-point only.
 
@@ -25,4 +23,4 @@ class OSC(VICES):
         """Physical units of a policy action in [-1, 1]^12."""
         free = super().decode(action)
         held = jnp.full_like(free.kp_pos, self.kp)
-        return free.replace(kp_pos=held, kp_ori=held)  # pyright: ignore[reportAttributeAccessIssue]
+        return free.replace(kp_pos=held, kp_ori=held)

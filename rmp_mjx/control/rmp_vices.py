@@ -18,7 +18,9 @@ from rmp_mjx.control.stirring import Stirring
 from rmp_mjx.control.torque import scale_torque
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.control.yielding import Yielding, limit_yielding
+from rmp_mjx.names import unknown
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.rmp.leaves.collision import collision_near
@@ -32,15 +34,13 @@ from rmp_mjx.robot.kinematics import (
     site_pose,
     site_state,
 )
-from rmp_mjx.robot.mjcf import unknown
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.shapes import KINDS
 from rmp_mjx.types import Action, ControlOutput, Setpoint
-from rmp_mjx.vec import store
+from rmp_mjx.xla import materialize
 
 
-@struct.dataclass
-class RMPVICES:
+class RMPVICES(Pytree):
     r"""Variable-impedance control as the attractor of an RMP-tree (paper, section III).
 
     One call evaluates the tree at (q, qd), resolves its root in the inertia metric and
@@ -149,7 +149,7 @@ class RMPVICES:
         site = site_state(self.robot, arm)
         if self.stirring is not None:
             stirred = self.stirring(setpoint.time, beside, site.v)
-            setpoint = setpoint.replace(p_des=setpoint.p_des + stirred)  # pyright: ignore[reportAttributeAccessIssue]
+            setpoint = setpoint.replace(p_des=setpoint.p_des + stirred)
         if self.jacobian == "autodiff":
             tree = rmp_vices_tree(self, setpoint, obstacles, Mq, yielded)
             root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
@@ -159,7 +159,7 @@ class RMPVICES:
                 branches.append(self.joint_limit(q, qd))
             if self.posture is not None:
                 branches.append(self.posture(q, qd, Mq))
-            root = jax.tree.map(store, functools.reduce(operator.add, branches))
+            root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
         qdd = resolve(root, self.regularizer * Mq)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
         tau, scale = scale_torque(dynamic, bias, self.robot.tau_max)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float
 
 from rmp_mjx.control.yielding import Yielding
+from rmp_mjx.pytree import Pytree
 
 RATIOS = (1.0, 0.618, 0.382)
 """Rates of the three axes, relative to the first: the curve does not close."""
 
 
-@struct.dataclass
-class Stirring:
+class Stirring(Pytree):
     r"""Displacement of the set-point beside an obstacle, at clearance c and time t.
 
     .. math:: A\, s\, e^{-|v|^2 / v_0^2}

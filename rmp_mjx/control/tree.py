@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +67,6 @@ def rmp_vices_tree(
     return Node(identity_map(), tuple(children))
 
 
-@flax.struct.dataclass
 class InertialPosture(Leaf):
     """The posture leaf with the inertia as its metric."""
 
@@ -82,7 +80,6 @@ class InertialPosture(Leaf):
         return self.posture(x, xd, self.Mq)
 
 
-@flax.struct.dataclass
 class Masked(Leaf):
     """A leaf that counts only where its obstacle slot is in use."""
 

@@ -10,14 +10,14 @@ from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.torque import clip_torque
 from rmp_mjx.math import critical_damping, orientation_error, psd_solve
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, site_pose, site_state
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 
 
-@struct.dataclass
-class VICES:
+class VICES(Pytree):
     r"""Decoupled operational-space impedance control (paper, eq. 2).
 
     .. math::

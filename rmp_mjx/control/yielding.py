@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Pytree
 
-@struct.dataclass
-class Yielding:
+
+class Yielding(Pytree):
     r"""Weight of the orientation attractor where an obstacle or a limit leaves room c.
 
     .. math:: h = h_{least}^{\,s}, \quad

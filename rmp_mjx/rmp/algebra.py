@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.math import psd_solve
+from rmp_mjx.pytree import Pytree
 
 _HIGHEST = "highest"
 
 
-@flax.struct.dataclass
-class RMP:
+class RMP(Pytree):
     """A Riemannian Motion Policy ``(f, M)`` in natural form on an n-dimensional space.
 
     The acceleration it asks for is any solution of ``M a = f``.

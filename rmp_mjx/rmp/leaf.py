@@ -7,14 +7,15 @@ import abc
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp.algebra import RMP
 
 
-class Leaf(abc.ABC):
+class Leaf(Pytree, abc.ABC):
     """A motion policy on the coordinate ``x`` of its parent node.
 
-    Concrete leaves are `flax.struct.dataclass` pytrees whose parameters are array
-    leaves, so they can be traced, vmapped, differentiated and learned.
+    A leaf is a pytree whose fields are its parameters: array leaves that can be traced,
+    vmapped, differentiated and learned. A subclass needs no decorator.
     """
 
     @abc.abstractmethod

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Pytree
 
-@flax.struct.dataclass
-class TaskMap:
+
+class TaskMap(Pytree):
     """A differentiable map ``y = fn(x)``, or ``y = fn(params, x)`` with parameters.
 
     The value may have any shape; it is flattened row by row, so a distance becomes
@@ -47,8 +48,7 @@ class TaskMap:
         return jnp.reshape(y, (-1,))
 
 
-@flax.struct.dataclass
-class Pushed:
+class Pushed(Pytree):
     """State of a child node, with the derivatives needed to pull a policy back."""
 
     x: Float[Array, " m"]

@@ -6,18 +6,17 @@ import functools
 import operator
 from collections.abc import Sequence
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp.algebra import RMP, pullback
 from rmp_mjx.rmp.leaf import Leaf as Leaf
 from rmp_mjx.rmp.taskmap import TaskMap, pushforward
 
 
-@flax.struct.dataclass
-class Node:
+class Node(Pytree):
     """An edge of the tree and what hangs on it: ``children`` live on ``psi(x)``."""
 
     psi: TaskMap
@@ -26,8 +25,7 @@ class Node:
     """Subtrees and leaves on this node's coordinate; empty contributes nothing."""
 
 
-@flax.struct.dataclass
-class Siblings:
+class Siblings(Pytree):
     """K children of one structure, evaluated together by vmap and summed.
 
     ``child`` is one subtree whose array leaves carry a leading axis K. Scalars (Python

@@ -7,11 +7,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.types import Constant
 
 
-@struct.dataclass
-class Capsules:
+class Capsules(Pytree):
     """Link capsules in the frames of the joints that move them."""
 
     start: Float[Constant, "c 3"]
@@ -28,8 +28,7 @@ class Capsules:
     """Capsule pairs (far, near) that self-collision watches."""
 
 
-@struct.dataclass
-class ControlPoints:
+class ControlPoints(Pytree):
     """Spheres inscribed in the link capsules."""
 
     offset: Float[Constant, "p 3"]

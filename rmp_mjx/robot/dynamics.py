@@ -14,7 +14,8 @@ from rmp_mjx.robot.kinematics import (
     joint_metric,
 )
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.vec import Vec, store, xyz
+from rmp_mjx.vec import Vec, xyz
+from rmp_mjx.xla import materialize
 
 
 def dynamics(
@@ -66,7 +67,7 @@ def dynamics(
         moment.cross(S.lin) + Vec(*(row @ S.ang for row in inertia)),
     )
     rotors = jnp.diag(jnp.asarray(robot.armature, arm.p.dtype))
-    Mq = store(joint_metric(S, momentum) + rotors)
+    Mq = materialize(joint_metric(S, momentum) + rotors)
     return Mq, joint_forces(S, sums[10:])
 
 

@@ -22,16 +22,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Constant
 from rmp_mjx.vec import Vec
 
 
-@struct.dataclass
-class Motion:
+class Motion(Pytree):
     """Spatial motion vectors (twists, joint columns, accelerations), one per column."""
 
     lin: Vec
@@ -63,8 +62,7 @@ class Motion:
         return Motion(self.lin * s, self.ang * s)
 
 
-@struct.dataclass
-class ArmState:
+class ArmState(Pytree):
     """Where every joint frame is and how it moves."""
 
     p: Float[Array, "3 n"]
@@ -154,8 +152,7 @@ def joint_metric(S: Motion, F: Motion) -> Float[Array, "n n"]:
     return jnp.where(upper, G, G.T)
 
 
-@struct.dataclass
-class SiteState:
+class SiteState(Pytree):
     """Pose and motion of the end-effector site."""
 
     p: Float[Array, " 3"]

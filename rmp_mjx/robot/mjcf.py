@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 
+from rmp_mjx.names import unknown
+
 
 class RobotError(ValueError):
     """The MJCF, or a name given with it, cannot serve as a robot."""
-
-
-def unknown(kind: str, name: str, valid: Sequence[str]) -> str:
-    """Message for a name that does not exist, with those that do."""
-    near = difflib.get_close_matches(name, valid, n=1)
-    hint = f" Did you mean '{near[0]}'?" if near else ""
-    return f"unknown {kind} '{name}'; valid names: {', '.join(valid)}.{hint}"
 
 
 def read_spec(path: str | Path) -> mujoco.MjSpec:

@@ -11,6 +11,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float
 
+from rmp_mjx.names import unknown
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot.control_points import (
     Capsules,
     ControlPoints,
@@ -24,7 +26,6 @@ from rmp_mjx.robot.mjcf import (
     home_configuration,
     lock_other_joints,
     read_spec,
-    unknown,
 )
 from rmp_mjx.types import Constant
 
@@ -38,8 +39,7 @@ SPACING = 0.0135
 """Default distance between control points [m]: about 64 of them on the Jaco 2."""
 
 
-@struct.dataclass
-class Robot:
+class Robot(Pytree):
     """A fixed-base serial arm: constants of its kinematics, dynamics and geometry.
 
     Each joint has a frame on its axis with z along it; everything that moves with a
@@ -209,9 +209,7 @@ class Robot:
             points=sample_control_points(
                 model, data, capsules, bodies, frames_p, frames_R, spacing
             ),
-            capsules=capsules.replace(  # pyright: ignore[reportAttributeAccessIssue]
-                pairs=touching_pairs(model, capsules)
-            ),
+            capsules=capsules.replace(pairs=touching_pairs(model, capsules)),
             hinge=tuple(
                 bool(model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE) for j in ids
             ),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp import RMP
 from rmp_mjx.robot.kinematics import (
     ArmState,
@@ -20,8 +20,7 @@ from rmp_mjx.robot.model import Robot
 from rmp_mjx.vec import Vec, xyz
 
 
-@struct.dataclass
-class PointState:
+class PointState(Pytree):
     """Position, velocity and bias acceleration of p control points, (p,) each."""
 
     x: Vec
@@ -32,8 +31,7 @@ class PointState:
     """Accelerations while qdd = 0 (the curvature Jdot qd) [m/s^2]."""
 
 
-@struct.dataclass
-class PointRMP:
+class PointRMP(Pytree):
     """Sum of what all obstacles ask of each control point: natural form on R^3."""
 
     f: Vec

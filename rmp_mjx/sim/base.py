@@ -8,8 +8,9 @@ from typing import Protocol
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Bool, Float
+
+from rmp_mjx.pytree import Pytree
 
 PAIR_SENSOR = "touch/"
 """Prefix of the contact sensors that watch one geom pair each."""
@@ -29,8 +30,7 @@ class PhysicsError(ValueError):
     """The engine is unknown, is missing, or cannot simulate this model."""
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(Pytree):
     """All that must be carried from one physics step to the next."""
 
     qpos: Float[Array, " nq"]
@@ -45,8 +45,7 @@ class PhysicsState:
     """Contact sensors of the last step."""
 
 
-@struct.dataclass
-class Contacts:
+class Contacts(Pytree):
     """Contact of every watched geom pair in one physics step."""
 
     touching: Bool[Array, " pairs"]

@@ -59,9 +59,7 @@ class MujocoPhysics:
             default=functools.partial(_by_copies, step, shapes),
         )
         qpos, qvel, warmstart, sensors = (jnp.where(good, x, jnp.nan) for x in moved)
-        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            qpos=qpos, qvel=qvel, warmstart=warmstart, sensors=sensors
-        )
+        return state.replace(qpos=qpos, qvel=qvel, warmstart=warmstart, sensors=sensors)
 
     def _step_host(self, threads, out, given):
         size = int(np.prod(given[0].shape[:-1], dtype=int))

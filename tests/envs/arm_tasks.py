@@ -4,15 +4,14 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.types import ControlOutput, Setpoint
 
 LANES = 8
 
 
-@struct.dataclass
-class Torques:
+class Torques(Pytree):
     """A controller that compiles fast: the action is a torque on top of `hold`."""
 
     hold: jax.Array

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from arm_tasks import LANES, Arm, Torques, first
 
 import envs
 from rmp_mjx.robot import Robot
+from tests.envs.arm_tasks import LANES, Arm, Torques, first
 
 
 @pytest.fixture(scope="session")

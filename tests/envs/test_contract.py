@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_tasks import Torques
 from brax.envs.wrappers import training as brax_training
 
 import envs
 from envs.brax import BraxTask
-from rmp_mjx.training.episodes import REDUCTIONS
+from rmp_mjx.training.learning.episodes import REDUCTIONS
+from tests.envs.arm_tasks import Torques
 
 LANES = 4
 LIMIT = 5

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from arm_tasks import LANES, Torques
 
 import envs
 from envs.door import GOAL, HANDLE, VARIANTS
 from envs.safety import SafetyRecord
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim.base import pair_sensors
+from tests.envs.arm_tasks import LANES, Torques
 
 BARS = set(HANDLE)
 HAND = {"arm/hand", "arm/fingers"}

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from arm_tasks import LANES
+
+from tests.envs.arm_tasks import LANES
 
 STEPS = 60  # 3 s
 TABLE, LIMIT, SPHERE, FREE = 0, 1, 2, 7

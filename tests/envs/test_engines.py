@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_tasks import LANES
+
+from tests.envs.arm_tasks import LANES
 
 
 def test_both_engines_step_the_task_alike(make, close, quiet):

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_tasks import Torques
 
 import envs
+from tests.envs.arm_tasks import Torques
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra `gym`")
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from arm_tasks import Torques
 
 import envs
 from envs.push import FARTHEST_GOAL, GOAL_HIGH, GOAL_LOW, NEAREST_GOAL
@@ -13,6 +12,7 @@ from envs.safety import SafetyRecord
 from envs.scene import TABLE_HEIGHT
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim.base import pair_sensors
+from tests.envs.arm_tasks import Torques
 
 HAND = {"arm/hand", "arm/fingers"}
 CORNERS = 0.03 * np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_tasks import LANES
 
 from envs.safety import Motion, Torques
+from tests.envs.arm_tasks import LANES
 
 DOWN, SPHERE, SIDE, LIMIT, TURN = 0, 1, 2, 3, 4  # lanes; the others rest
 REST = jnp.zeros((LANES, 12))

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_tasks import Torques
 from brax.training.agents.ppo import networks
 from brax.training.agents.ppo import train as brax_ppo
 
 import envs
 from envs.brax import BraxTask
+from tests.envs.arm_tasks import Torques
 
 pytestmark = pytest.mark.skipif(
     not hasattr(jax, "device_put_replicated"),

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_tasks import LANES, first
+
+from tests.envs.arm_tasks import LANES, first
 
 REST = jnp.zeros((LANES, 12))
 

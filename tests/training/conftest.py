@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rmp_mjx.training import run_folder
-from rmp_mjx.training.checkpoint import Checkpointer
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.ppo import make_ppo
-from rmp_mjx.training.train import train
+from rmp_mjx.training.learning.ppo import make_ppo
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.checkpoint import Checkpointer
+from rmp_mjx.training.runs.loop import train
 from tests.training import toys
 
 SMALL = {

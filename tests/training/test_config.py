@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from rmp_mjx.training import cli
+from envs import cli
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,

@@ -1,17 +1,17 @@
 """Toy environments, each isolating one fault of a PPO implementation.
 
-They follow the environment protocol of `rmp_mjx.training.rollout.Env`.
+They follow the environment protocol of `rmp_mjx.training.learning.rollout.Env`.
 """
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+
+from rmp_mjx.pytree import Pytree
 
 
-@struct.dataclass
-class ToyState:
+class ToyState(Pytree):
     """State of a toy environment."""
 
     data: jax.Array

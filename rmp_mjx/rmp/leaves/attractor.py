@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -11,7 +10,6 @@ from rmp_mjx.rmp.algebra import RMP
 from rmp_mjx.rmp.leaf import Leaf
 
 
-@flax.struct.dataclass
 class PositionAttractor(Leaf):
     """Spring and damper towards a point: ``a = kp (p_des - x) - kd xd``, metric I.
 
@@ -68,7 +66,6 @@ def orientation_attractor(
     return RMP(f=weight * alpha, M=weight * jnp.eye(3, dtype=R.dtype))
 
 
-@flax.struct.dataclass
 class OrientationAttractor(Leaf):
     r"""Orientation impedance as a leaf of the generic tree.
 

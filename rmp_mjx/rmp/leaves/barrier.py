@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.rmp.leaf import ScalarLeaf
 
 
-@flax.struct.dataclass
 class Barrier(ScalarLeaf):
     r"""Velocity-gated barrier on a signed distance ``d`` with speed ``xd = dd/dt``.
 

@@ -23,7 +23,6 @@ def collision_near() -> Barrier:
     )
 
 
-@flax.struct.dataclass
 class PaperCollision(ScalarLeaf):
     r"""The collision leaf in the paper's form, with switchable signs.
 
@@ -65,7 +64,6 @@ class PaperCollision(ScalarLeaf):
         return m * (sign * self.eta * xd), m
 
 
-@flax.struct.dataclass
 class GDSCollision(ScalarLeaf):
     r"""The geodesic (GDS) form: metric, curvature, damping and optional potential.
 
@@ -127,7 +125,6 @@ class GDSCollision(ScalarLeaf):
         return scale * f, scale * m
 
 
-@flax.struct.dataclass
 class LulaCollision(ScalarLeaf):
     r"""The collision leaf of NVIDIA's Lula RMPflow, with its Franka defaults.
 

@@ -17,7 +17,6 @@ def joint_limit_barrier() -> Barrier:
     return Barrier(mu=2.5e-3, eps=0.2, eta=40.0, r=0.2, margin=0.14, cap=1e3, k_out=2e3)
 
 
-@flax.struct.dataclass
 class JointLimitBarrier(ScalarLeaf):
     """The one-dimensional `Barrier` on both distances, ``q - lower``, ``upper - q``.
 
@@ -47,7 +46,6 @@ def _span(lower: Array, upper: Array) -> tuple[Array, Array, Array]:
     return low, jnp.where(limited, upper, 1.0) - low, limited
 
 
-@flax.struct.dataclass
 class RMPflowJointLimit(ScalarLeaf):
     r"""The velocity-gated joint-limit metric of RMPflow, as its authors code it.
 
@@ -107,7 +105,6 @@ class RMPflowJointLimit(ScalarLeaf):
         return jnp.where(limited, f, 0.0), jnp.where(limited, m, 0.0)
 
 
-@flax.struct.dataclass
 class LulaJointLimit(ScalarLeaf):
     r"""The joint-limit leaf of NVIDIA's Lula RMPflow, one policy per range end.
 

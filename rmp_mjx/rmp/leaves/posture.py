@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -11,7 +10,6 @@ from rmp_mjx.rmp.algebra import RMP
 from rmp_mjx.rmp.leaf import Leaf
 
 
-@flax.struct.dataclass
 class Posture(Leaf):
     r"""Spring and damper in joint space, :math:`a = k_q (q_0 - q) - k_d \dot q`.
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.rmp.leaf import ScalarLeaf
 
 
-@flax.struct.dataclass
 class VelocityCap(ScalarLeaf):
     r"""Damping whose metric grows without bound as the speed reaches its limit.
 

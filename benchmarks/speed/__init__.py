@@ -1,0 +1,1 @@
+"""Speed: of the controller, the environments, training, and its regression gate."""

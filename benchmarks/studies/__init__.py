@@ -1,0 +1,1 @@
+"""Studies of safety, success, accuracy and parameters."""

@@ -1,0 +1,68 @@
+"""The base of the project's pytrees: immutable, comparable, hashable, printable."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+from flax import struct
+
+
+class Pytree(struct.PyTreeNode):
+    """A frozen dataclass whose fields are pytree nodes.
+
+    Fields are array leaves or further pytrees; `struct.field(pytree_node=False)` marks
+    a static one. Subclasses need no decorator. Two objects are equal if they have the
+    same structure and the same leaves, so that `jax.jit`, `jax.vmap` and `jax.grad`
+    take a callable pytree like any function, and compile it once for equal objects.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(eq=False, repr=False, **kwargs)
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if type(self) is not type(other):
+            return NotImplemented
+        mine, structure = jax.tree.flatten(self)
+        others, other_structure = jax.tree.flatten(other)
+        return structure == other_structure and all(map(_same, mine, others))
+
+    def __hash__(self) -> int:
+        """Hash of the structure: equal objects have the same one."""
+        return hash((type(self), jax.tree.structure(self)))
+
+    def __repr__(self) -> str:
+        """Fields by name; an array of more than four entries by dtype and shape."""
+        fields = [
+            f"{f.name}={_show(getattr(self, f.name))}" for f in dataclasses.fields(self)
+        ]
+        line = f"{type(self).__name__}({', '.join(fields)})"
+        if len(line) <= 88:
+            return line
+        inner = ",\n".join("  " + field.replace("\n", "\n  ") for field in fields)
+        return f"{type(self).__name__}(\n{inner},\n)"
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two leaves are the same; traced values are the same only as objects."""
+    if a is b:
+        return True
+    if isinstance(a, jax.core.Tracer) or isinstance(b, jax.core.Tracer):
+        return False
+    a, b = np.asarray(a), np.asarray(b)
+    return a.dtype == b.dtype and a.shape == b.shape and bool(np.array_equal(a, b))
+
+
+def _show(value: Any) -> str:
+    """A field's value on a line, or a nested pytree on several."""
+    if isinstance(value, str) and len(value) > 60:
+        return f"<{len(value)} characters>"
+    if isinstance(value, (np.ndarray, jax.Array)):
+        if isinstance(value, jax.core.Tracer) or value.size > 4:
+            return f"{value.dtype}{list(value.shape)}"
+        return str(np.asarray(value).tolist())
+    return repr(value)

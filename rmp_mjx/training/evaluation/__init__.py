@@ -1,0 +1,1 @@
+"""Evaluation of a policy: episodes, statistics, tables, figures, films."""

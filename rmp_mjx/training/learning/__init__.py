@@ -1,0 +1,1 @@
+"""Proximal policy optimisation: roll-outs, losses, updates, over seeds and devices."""

@@ -1,0 +1,116 @@
+"""Steps that became non-finite: noted on the device, written to files for a replay."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rmp_mjx.pytree import Pytree
+from rmp_mjx.training.runs.checkpoint import named_leaves
+
+ACTION, ABOUT = "action", "about"
+"""Entries of a file besides the leaves of the state."""
+
+
+class Fault(Pytree):
+    """The first step of each environment in an unroll that became non-finite."""
+
+    happened: Bool[Array, "*b"]
+    """Whether there was one; the rest means nothing where there was none."""
+    env_state: Any
+    """The environments' states before it."""
+    action: Float[Array, "*b m"]
+    """The actions that led to it."""
+
+
+def none(env_state: Any, num_envs: int, action_size: int) -> Fault:
+    """No fault yet."""
+    return Fault(
+        happened=jnp.zeros(num_envs, bool),
+        env_state=env_state,
+        action=jnp.zeros((num_envs, action_size)),
+    )
+
+
+def dump(
+    fault: Fault, folder: Path, name: str, about: Mapping[str, Any], most: int
+) -> list[Path]:
+    """Write the faults of a batch to files, one each.
+
+    Args:
+        fault: Faults, (b,).
+        folder: Where the files go; it is made.
+        name: Beginning of their names.
+        about: What the reader needs besides, JSON-ready; the lane is added.
+        most: At most this many files.
+
+    Returns:
+        The files.
+    """
+    lanes = np.flatnonzero(np.asarray(fault.happened))[:most]
+    files = []
+    for lane in lanes.tolist():
+        one = jax.tree.map(lambda x, lane=lane: x[lane], fault)
+        leaves = named_leaves(one.env_state).items()
+        arrays: dict[str, Any] = {path: _numbers(leaf) for path, leaf in leaves}
+        arrays[ACTION] = np.asarray(one.action)
+        arrays[ABOUT] = np.array(json.dumps({**about, "lane": lane}))
+        folder.mkdir(parents=True, exist_ok=True)
+        files.append(folder / f"{name}-lane{lane}.npz")
+        np.savez(files[-1], **arrays)
+    return files
+
+
+def load(path: Path, template: Any) -> tuple[Any, Float[np.ndarray, " m"]]:
+    """Read a fault.
+
+    Args:
+        path: A file of `dump`.
+        template: Shapes of one environment's state.
+
+    Returns:
+        The state before the step, and the action.
+
+    Raises:
+        ValueError: The file is of another task.
+    """
+    with np.load(path) as stored:
+        missing = named_leaves(template).keys() - set(stored.files)
+        if missing:
+            raise ValueError(f"{path} is of another task: no {', '.join(missing)}")
+        leaves = [
+            _array(stored[name], leaf) for name, leaf in named_leaves(template).items()
+        ]
+        action = stored[ACTION]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves), action
+
+
+def about(path: Path) -> dict[str, Any]:
+    """What a file says about where it comes from.
+
+    Raises:
+        ValueError: It is no file of `dump`.
+    """
+    try:
+        with np.load(path) as stored:
+            return json.loads(str(stored[ABOUT]))
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no dump of a non-finite step: {error}") from error
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _numbers(leaf: Any) -> np.ndarray:
+    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _array(stored: np.ndarray, like: Any) -> Array:
+    value = jnp.asarray(stored)
+    return jax.random.wrap_key_data(value) if _is_key(like) else value

@@ -1,0 +1,97 @@
+"""Several agents in one program: seeds are one more axis of everything.
+
+With one seed the axis is not there: nothing differs from training a single agent.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from jaxtyping import Array, Key
+
+from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.learning import devices
+from rmp_mjx.training.learning.ppo import PPO, TrainState, make_ppo
+from rmp_mjx.training.learning.rollout import Env
+from rmp_mjx.training.runs import run_folder
+
+
+class Programs(NamedTuple):
+    """The compiled parts of an iteration, for all seeds, on all devices."""
+
+    ppo: PPO
+    """One agent's functions."""
+    mesh: Mesh
+    """The devices."""
+    init: Callable[[Any], TrainState]
+    """First state, from the seeds' keys."""
+    gather: Callable[[TrainState], Any]
+    """`PPO.gather`; consumes the state."""
+    learn: Callable[[TrainState, Any], Any]
+    """`PPO.learn`; consumes the state."""
+    place: Callable[[TrainState], TrainState]
+    """Spread a state over the devices, every array in a buffer of its own."""
+
+
+def keys(config: TrainConfig) -> Key[Array, "*k"]:
+    """The keys that the agents start from: one key, or (num_seeds,)."""
+    if config.num_seeds == 1:
+        return jax.random.key(config.seed)
+    return jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
+
+
+def title(config: TrainConfig) -> str:
+    """The seeds in words."""
+    first, last = config.seed, config.seed + config.num_seeds - 1
+    return f"seed {first}" if last == first else f"seeds {first} to {last}"
+
+
+def folders(config: TrainConfig, folder: Path) -> list[Path]:
+    """Where each seed's own results go: the run's folder itself where it has one."""
+    if config.num_seeds == 1:
+        return [folder]
+    numbers = range(config.seed, config.seed + config.num_seeds)
+    return [folder / run_folder.SEEDS / str(number) for number in numbers]
+
+
+def programs(env: Env, config: TrainConfig) -> Programs:
+    """Compile PPO for all seeds; the devices share every agent's environments.
+
+    Args:
+        env: Single environment.
+        config: Validated configuration.
+    """
+    mesh = devices.make_mesh(config.groups, config.num_devices)
+    ppo = make_ppo(env, config, mesh)
+    seeded = int(config.num_seeds > 1)
+    many = jax.vmap if seeded else lambda function: function
+    whole = devices.placed(mesh, None)
+    lies: dict[str, Any] = {f.name: whole for f in dataclasses.fields(TrainState)}
+    lies["rollout"] = devices.placed(mesh, seeded)
+    state = TrainState(**lies)
+    data = devices.placed(mesh, seeded + 1)
+    return Programs(
+        ppo=ppo,
+        mesh=mesh,
+        init=jax.jit(many(ppo.init), out_shardings=state),
+        gather=jax.jit(
+            many(ppo.gather), donate_argnums=0, out_shardings=(state, data, whole)
+        ),
+        learn=jax.jit(many(ppo.learn), donate_argnums=0, out_shardings=(state, whole)),
+        place=jax.jit(lambda tree: jax.tree.map(jnp.copy, tree), out_shardings=state),
+    )
+
+
+def of_seed(tree: Any, index: int, config: TrainConfig) -> Any:
+    """One seed's part of a tree: of a state, of metrics, or of an agent."""
+    return jax.tree.map(lambda x: x[index], tree) if config.num_seeds > 1 else tree
+
+
+def shapes(ppo: PPO, config: TrainConfig) -> TrainState:
+    """Shapes and dtypes of the state of all seeds."""
+    init = jax.vmap(ppo.init) if config.num_seeds > 1 else ppo.init
+    return jax.eval_shape(init, keys(config))

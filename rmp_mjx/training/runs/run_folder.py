@@ -1,0 +1,225 @@
+"""The folder of a run: what it contains, and who may write into it."""
+
+import fcntl
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import IO
+
+import jax
+
+from rmp_mjx.training.runs import trackers
+from rmp_mjx.training.config import (
+    ConfigError,
+    TrainConfig,
+    differing_fields,
+    load_config,
+    save_config,
+    write_text,
+)
+
+CONFIG = "config.json"
+VERSIONS = "versions.json"
+METRICS = "metrics.parquet"
+CHECKPOINTS = "checkpoints"
+TENSORBOARD = "tensorboard"
+NONFINITE = "nonfinite"
+TRACKED = ("wandb_run", "mlflow_run", "wandb")
+CURVE = "learning_curve.png"
+SEEDS = "seeds"
+SEED_CURVES = f"{SEEDS}/curves.parquet"
+EVALUATION = "eval.json"
+EPISODES = "episodes.parquet"
+FORCES = "contact_forces.png"
+CLEARANCES = "clearances.png"
+INSTANCE = "instance.png"
+STORYBOARD = "storyboard.png"
+VIDEO = "video.mp4"
+LOCK = "lock"
+PACKAGES = (
+    "jax",
+    "jaxlib",
+    "brax",
+    "flax",
+    "optax",
+    "mujoco",
+    "mujoco-mjx",
+    "numpy",
+    "rmp-mjx",
+)
+RESULTS = (
+    CONFIG,
+    VERSIONS,
+    METRICS,
+    CHECKPOINTS,
+    TENSORBOARD,
+    NONFINITE,
+    *TRACKED,
+    CURVE,
+    SEEDS,
+    EVALUATION,
+    EPISODES,
+    FORCES,
+    CLEARANCES,
+    INSTANCE,
+    STORYBOARD,
+    VIDEO,
+)
+
+
+def default_run_dir(config: TrainConfig) -> Path:
+    """A new folder name under runs/, from the task, the controller and the time."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{config.env}-{config.controller}-seed{config.seed}-{stamp}"
+    return Path("runs") / name
+
+
+def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
+    """Prepare and lock the folder of a run; starts no JAX backend.
+
+    Args:
+        config: Validated configuration.
+
+    Returns:
+        The folder, and its lock: the lock lasts as long as the file stays open.
+
+    Raises:
+        ConfigError: The folder has results already, belongs to another
+            configuration, cannot be written, or another process uses it.
+    """
+    trackers.check(config)
+    if config.resume:
+        folder = Path(config.resume)
+        different = differing_fields(load_config(folder / CONFIG), config)
+        if different:
+            changes = ", ".join(f"{k}: {a} -> {b}" for k, (a, b) in different.items())
+            raise ConfigError(f"a resumed run keeps its configuration ({changes})")
+        newer = changed_software(folder)
+        if newer and not config.allow_changes:
+            raise ConfigError(
+                f"not what this run was trained with: {', '.join(newer)}; "
+                "--allow_changes resumes it all the same, though not exactly"
+            )
+    else:
+        folder = Path(config.run_dir) if config.run_dir else default_run_dir(config)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = _lock(folder)
+    except OSError as error:
+        raise ConfigError(f"cannot write to {folder}: {error.strerror}") from error
+    if not config.resume:
+        others = sorted(p.name for p in folder.iterdir() if p.name != LOCK)
+        if others and not config.overwrite:
+            raise ConfigError(
+                f"{folder} is not empty: --resume {folder} continues that run, "
+                "--overwrite deletes its results"
+            )
+        for name in RESULTS:
+            path = folder / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return folder, lock
+
+
+def _lock(folder: Path) -> IO[str]:
+    """Take the folder's lock; the system releases it when the process ends."""
+    lock = (folder / LOCK).open("a+")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        lock.seek(0)
+        owner = lock.read().strip() or "another process"
+        lock.close()
+        raise ConfigError(f"{folder} is in use by {owner}") from error
+    lock.truncate(0)
+    lock.write(f"process {os.getpid()} on {platform.node()}\n")
+    lock.flush()
+    return lock
+
+
+def describe(folder: Path, config: TrainConfig) -> list[str]:
+    """Write the configuration and the versions that a run uses.
+
+    A resumed run adds its versions to those that it was started with.
+
+    Returns:
+        What has changed since the run was last continued: a resumed run is
+        bit-identical to an uninterrupted one only where this is empty.
+    """
+    save_config(config, folder / CONFIG)
+    history, now = _history(folder), versions()
+    write_text(folder / VERSIONS, json.dumps([*history, now], indent=2) + "\n")
+    return changes_since(history, now)
+
+
+def _history(folder: Path) -> list[dict[str, str]]:
+    """Versions that a run was started and continued with."""
+    path = folder / VERSIONS
+    try:
+        return json.loads(path.read_text()) if path.exists() else []
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path} is damaged ({error}): delete it to go on") from error
+
+
+def changed_software(folder: Path) -> list[str]:
+    """What is not as it was when a run was last continued; starts no JAX backend."""
+    return changes_since(_history(folder), software())
+
+
+def changes_since(history: list[dict[str, str]], now: dict[str, str]) -> list[str]:
+    """What differs from the last of the earlier versions."""
+    before = history[-1] if history else now
+    return [
+        f"{name} {before.get(name)} -> {now[name]}"
+        for name in (*PACKAGES, "python", "git", "device")
+        if name in now and before.get(name) != now[name]
+    ]
+
+
+def software() -> dict[str, str]:
+    """Versions of the packages and of this code; starts no JAX backend."""
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return {"python": platform.python_version(), **found, "git": _git_revision()}
+
+
+def device(count: int) -> str:
+    """Number and kind of devices."""
+    first = jax.devices()[0]
+    return f"{count} x {first.device_kind} ({first.platform})"
+
+
+def versions() -> dict[str, str]:
+    """What this process runs on: packages, code, device, command line."""
+    return {
+        **software(),
+        "device": device(jax.device_count()),
+        "machine": f"{platform.platform()}, {os.cpu_count()} CPUs",
+        "command": " ".join(sys.argv),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+
+
+def _git_revision() -> str:
+    """Revision of the working directory, with a mark for uncommitted changes."""
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=False,
+            cwd=Path(__file__).parent,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
+    return done.stdout.strip() or "unknown"

@@ -1,0 +1,95 @@
+"""When a run saves, and what happens where it cannot."""
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.checkpoint import MERITS, Checkpointer, SaveError
+from rmp_mjx.training.runs.metrics import Row
+from rmp_mjx.training.runs.stopping import TrainingFailure
+
+
+class Saver:
+    """Writes a run's checkpoints; one that fails is tried again at the next interval.
+
+    A checkpoint's merit is that of the episodes that finished since the one before.
+    """
+
+    def __init__(
+        self,
+        checkpoints: Checkpointer | None,
+        folder: Path,
+        note: Callable[[str], None],
+        last: int,
+    ):
+        """Start from a run's last checkpoint.
+
+        Args:
+            checkpoints: Where they go; None: another process writes them.
+            folder: The run's folder, for messages.
+            note: Called with one line where a save fails.
+            last: Iteration of the last checkpoint; 0: there is none.
+        """
+        self.last = last
+        self._checkpoints = checkpoints
+        self._folder = folder
+        self._note = note
+        self._failed = False
+        self._episodes = 0
+        self._sums = dict.fromkeys(MERITS, 0.0)
+
+    def count(self, rows: Sequence[Row]) -> None:
+        """Add an iteration's episodes, of all seeds, to the next checkpoint's merit."""
+        for row in rows:
+            finished = int(row["episode/finished"] or 0)
+            self._episodes += finished
+            for name in MERITS:
+                self._sums[name] += finished * float(row.get(f"episode/{name}") or 0.0)
+
+    def _merit(self) -> dict[str, float] | None:
+        if not self._episodes:
+            return None
+        return {name: total / self._episodes for name, total in self._sums.items()}
+
+    def save(self, iteration: int, state: Any, final: bool) -> None:
+        """Save, or say loudly that it failed.
+
+        Args:
+            iteration: Finished iterations.
+            state: All that training goes on with.
+            final: There is no next time.
+
+        Raises:
+            TrainingFailure: It failed twice in a row, or in the end.
+        """
+        try:
+            if self._checkpoints:
+                self._checkpoints.save(iteration, state, self._merit())
+        except SaveError as error:
+            problem = f"{error} ({_room(self._folder)})"
+            if final or self._failed:
+                raise TrainingFailure(
+                    f"iteration {iteration} is not saved: {problem}; "
+                    f"{self.how_to_continue()}"
+                ) from error
+            self._failed = True
+            self._note(f"NOT SAVED, trying again at the next interval: {problem}")
+            return
+        self.last, self._failed = iteration, False
+        self._episodes, self._sums = 0, dict.fromkeys(MERITS, 0.0)
+
+    def how_to_continue(self) -> str:
+        """What is saved, and the command that goes on from there."""
+        if not self.last:
+            return "nothing is saved yet"
+        return (
+            f"saved is iteration {self.last}; continue with\n"
+            f"  python train.py --resume {self._folder}"
+        )
+
+
+def _room(folder: Path) -> str:
+    free = shutil.disk_usage(folder).free
+    return f"{free / 2**20:,.0f} MiB free in {folder / run_folder.CHECKPOINTS}"

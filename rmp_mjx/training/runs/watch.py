@@ -1,0 +1,109 @@
+"""What a run watches itself for: bad numbers, and contacts that were not read."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from rmp_mjx.training.learning import faults, seeds
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.runs.metrics import SEED, Row
+from rmp_mjx.training.learning.ppo import TrainState
+
+MAX_LOST_FRACTION = 0.5
+"""Training stops where more of an iteration's steps than this become non-finite."""
+MAX_DUMPS = 5
+"""Non-finite steps of a run that are written to files."""
+
+
+class Watch:
+    """Looks at every iteration; says and writes what it finds."""
+
+    def __init__(self, config: TrainConfig, folder: Path, note: Callable[[str], None]):
+        """Nothing has happened yet.
+
+        Args:
+            config: Validated configuration.
+            folder: Run folder.
+            note: Called with a line for each finding, each kind once.
+        """
+        self._config = config
+        self._folder = folder / run_folder.NONFINITE
+        self._note = note
+        self._told: set[str] = set()
+
+    def _tell(self, kind: str, message: str) -> None:
+        if kind not in self._told:
+            self._told.add(kind)
+            self._note(message)
+
+    def verdict(self, rows: Sequence[Row]) -> str | None:
+        """Why training cannot go on after an iteration; None: it can."""
+        config = self._config
+        updates = config.num_updates_per_batch * config.num_minibatches
+        for row in rows:
+            lost = int(row["nonfinite_envs"] or 0)
+            skipped = int(row["learning/skipped_updates"] or 0)
+            if lost > MAX_LOST_FRACTION * config.steps_per_iteration:
+                cause = (
+                    f"{lost} of {config.steps_per_iteration} steps became non-finite"
+                )
+            elif skipped >= updates:
+                cause = f"all {updates} updates in a row had non-finite gradients"
+            else:
+                continue
+            seed = f", seed {row[SEED]}" if SEED in row else ""
+            return f"iteration {row['iteration']}{seed}: {cause}"
+        return None
+
+    def look(self, rows: Sequence[Row], fault: faults.Fault | None) -> None:
+        """Report an iteration's findings.
+
+        Args:
+            rows: Its rows, one for each seed.
+            fault: Its faults, fetched only where the rows count any.
+        """
+        overflow = max(row.get("episode/contact_overflow") or 0.0 for row in rows)
+        if overflow:
+            self._tell(
+                "overflow",
+                "warning: a pair of bodies had more contacts than are read: the forces "
+                "of these episodes are too low (column episode/contact_overflow)",
+            )
+        for k, row in enumerate(rows if fault else ()):
+            if row["nonfinite_envs"]:
+                self._dump(row, k, seeds.of_seed(fault, k, self._config))
+
+    def _dump(self, row: Row, index: int, fault: faults.Fault) -> None:
+        """Write faults for a replay, as long as there are few."""
+        config = self._config
+        room = MAX_DUMPS - len(list(self._folder.glob("*.npz")))
+        seed = config.seed + index
+        about = {
+            "config": dataclasses.asdict(config),
+            "iteration": row["iteration"],
+            "seed": seed,
+        }
+        name = f"iteration{row['iteration']}-seed{seed}"
+        try:
+            files = faults.dump(fault, self._folder, name, about, max(room, 0))
+        except OSError as error:
+            self._tell("dump", f"warning: {self._folder} cannot be written: {error}")
+            return
+        if files:
+            self._tell(
+                "nonfinite",
+                f"warning: iteration {row['iteration']}: {row['nonfinite_envs']} "
+                "environments became non-finite and were reset, their steps left out; "
+                f"look into it with\n  python -m benchmarks.replay {files[0]}",
+            )
+
+
+def is_finite(state: TrainState) -> bool:
+    """Whether all that has been learned is finite."""
+    learned = state.learner, state.normalizer, state.scale
+    leaves = jax.device_get(jax.tree.leaves(learned))
+    return all(np.isfinite(leaf).all() for leaf in leaves)

@@ -1,0 +1,376 @@
+"""The paper's grid on toy tasks: order, resumption, numbers, pages."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+from flax import struct
+from rich.console import Console
+from scipy import stats
+
+from benchmarks.paper import (
+    __main__,
+    cells,
+    deployment,
+    export,
+    failures,
+    measures,
+    pictures,
+    published,
+    report,
+    store,
+    tables,
+    targets,
+    tasks,
+    work,
+)
+from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
+from benchmarks.paper.store import Store
+from envs.types import METRICS
+from rmp_mjx.pytree import Pytree
+from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.runs import run_folder, saving
+from rmp_mjx.training.runs.loop import load_agent
+from tests.training.toys import ToyState
+
+
+class Arm(Pytree):
+    """A toy with an arm's metrics; VICES collides in a third of its steps."""
+
+    risk: float = struct.field(pytree_node=False)
+    observation_size: int = struct.field(pytree_node=False, default=2)
+    action_size: int = struct.field(pytree_node=False, default=1)
+    dt: float = struct.field(pytree_node=False, default=0.05)
+    episode_length: int = struct.field(pytree_node=False, default=6)
+
+    task_metrics = ()
+
+    @property
+    def metric_reductions(self):
+        return METRICS
+
+    def _state(self, key, obs, collision, reward):
+        metrics = dict.fromkeys(METRICS, jnp.float32(0.0))
+        metrics |= {
+            "collision": jnp.float32(collision),
+            "contact_force_peak": 40.0 * jnp.float32(collision),
+            "clearance": 0.1 - 0.1 * jnp.float32(collision),
+            "success": jnp.float32(reward > 0.5),
+        }
+        done = jnp.float32(collision)
+        return ToyState(key, obs, jnp.float32(reward), done, metrics, {})
+
+    def reset(self, rng):
+        return self._state(rng, jnp.zeros(2), False, 0.0)
+
+    def step(self, state, action):
+        key, draw = jax.random.split(state.data)
+        collision = jax.random.uniform(draw) < self.risk
+        return self._state(key, state.obs + 0.1, collision, 1.0 - jnp.abs(action[0]))
+
+
+TINY = dataclasses.replace(
+    PRESETS["smoke"],
+    training=TrainConfig(
+        num_envs=8,
+        unroll_length=8,
+        num_minibatches=2,
+        num_updates_per_batch=1,
+        num_timesteps=256,
+        hidden_sizes=(4,),
+        checkpoint_interval=2,
+        eval_episodes=0,
+        video=False,
+    ),
+    env_options=(),
+    episodes=20,
+    other_episodes=5,
+)
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """Every task is the toy; nothing is drawn; events are not looked into."""
+    risk = {"vices": 0.3, "rmp_vices": 0.02}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tasks, "load", lambda config: Arm(risk[config.controller]))
+        patch.setattr(failures, "describe", lambda env, results, tape: [EVENT])
+        patch.setattr(pictures, "save", lambda *args: None)
+        deployment._world.cache_clear()
+        yield
+        deployment._world.cache_clear()
+
+
+EVENT = {
+    "episode": 3,
+    "step": 5,
+    "kind": "collision",
+    "first": "arm/hand",
+    "second": "table",
+    "hand": True,
+    "gap": 0.001,
+    "force": 40.0,
+}
+
+
+@pytest.fixture(scope="module")
+def grid(toy, tmp_path_factory):
+    """A finished grid of two seeds; how often it was stopped, what it said."""
+    place = Store(tmp_path_factory.mktemp("paper"))
+    said = tmp_path_factory.mktemp("log") / "log"
+    with said.open("w") as file:
+        code = work.run(place, TINY, TINY.cells(), Console(file=file, width=200))
+    assert code == 0
+    return Store(place.folder), said.read_text()
+
+
+@pytest.fixture(scope="module")
+def pages(grid, tmp_path_factory):
+    """Both pages of the grid."""
+    folder = tmp_path_factory.mktemp("pages")
+    return report.write(Store(grid[0].folder), TINY, folder)
+
+
+def test_a_round_is_one_seed_of_all_six_cells():
+    preset = PRESETS["cpu"]
+    wanted = preset.cells()
+    assert [c.seed for c in wanted] == [seed for seed in range(5) for _ in range(6)]
+    first = {(cell.task, cell.variant) for cell in wanted[:6]}
+    assert first == {(task, variant) for task in TASKS for variant in PAPER}
+    everything = preset.cells(baselines=True)
+    assert everything[: len(wanted)] == wanted
+    assert {c.variant for c in everything[len(wanted) :]} == set(cells.BASELINES)
+    ordered = work.steps(preset, wanted)
+    columns = len(preset.columns)
+    assert all(step.column is None for step in ordered[:6])
+    assert all(step.column for step in ordered[6 : 6 + 6 * columns])
+    assert ordered[6 + 6 * columns].cell.seed == 1
+
+
+def test_presets_hold_to_the_papers_protocol():
+    """1.5e6 steps, 64-64; both controllers with the same settings."""
+    for name, seeds in (("cpu", 5), ("full", 10)):
+        preset = PRESETS[name]
+        assert (preset.seeds, preset.training.num_timesteps) == (seeds, 1_500_000)
+        assert preset.training.hidden_sizes == (64, 64)
+        ours, base = (preset.config(Cell("door", v, 0)) for v in ("rmp_vices", "vices"))
+        assert dataclasses.replace(ours, controller="vices") == base
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("door/vices", "TASK/VARIANT/SEED"),
+        ("door/vices/0/1", "TASK/VARIANT/SEED"),
+        ("window/vices/0", "trajectory, door, push"),
+        ("door/vice/0", "rmp_vices_literal"),
+        ("door/vices/x", "whole number"),
+    ],
+)
+def test_a_wrong_cell_exits_with_code_2(text, message, capsys):
+    assert __main__.main(["--only", text]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_report_of_an_empty_store_exits_with_code_2(tmp_path, capsys):
+    assert __main__.main(["--report", "--folder", str(tmp_path)]) == 2
+    assert "no finished training" in capsys.readouterr().err
+
+
+def test_every_cell_is_trained_and_deployed_in_every_column(grid):
+    place, said = grid
+    assert place.training.select("task", "variant", "seed").unique().height == 12
+    counts = place.episodes.group_by("column").len().sort("column")
+    assert counts.rows() == [("close", 12 * 20), ("free", 12 * 5)]
+    assert "36/36 deploy push/rmp_vices/1: free" in said
+    assert ", eta 0 h 00 min" in said
+    (one,) = [
+        about
+        for about in place.provenance
+        if about["kind"] == "training"
+        and (about["task"], about["variant"], about["seed"]) == ("door", "vices", 1)
+    ]
+    assert one["definition"]["seed"] == 1
+    assert {"git", "jax", "device"} <= one["history"][0].keys()
+
+
+def test_finished_work_is_not_repeated(grid, monkeypatch):
+    def refuse(*args):
+        pytest.fail("something was done again")
+
+    monkeypatch.setattr(work, "_do", refuse)
+    assert work.run(Store(grid[0].folder), TINY, TINY.cells(), QUIET) == 0
+
+
+def test_a_damaged_part_is_made_anew_and_a_changed_one_too(grid):
+    place, cell = grid[0], Cell("door", "vices", 0)
+    path = place.path(store.EPISODES, cell, "free")
+    whole = path.read_bytes()
+    assert deployment.is_deployed(place, TINY, cell, "free")
+    try:
+        path.write_bytes(whole[: len(whole) // 2])
+        assert not deployment.is_deployed(place, TINY, cell, "free")
+    finally:
+        path.write_bytes(whole)
+    longer = dataclasses.replace(TINY, other_episodes=6)
+    assert not deployment.is_deployed(place, longer, cell, "free")
+    assert deployment.is_deployed(place, longer, cell, "close")
+
+
+def test_a_run_of_other_settings_is_refused_before_anything_starts(grid, monkeypatch):
+    monkeypatch.setattr(work, "_do", lambda *args: pytest.fail("started"))
+    training = dataclasses.replace(TINY.training, learning_rate=1e-3)
+    other = dataclasses.replace(TINY, training=training)
+    with pytest.raises(ConfigError, match=r"learning_rate: 0\.0003 -> 0\.001"):
+        work.run(Store(grid[0].folder), other, other.cells(), QUIET)
+
+
+def test_a_stopped_grid_goes_on_to_the_same_bits(grid, toy, tmp_path, monkeypatch):
+    """Stopped in the midst of a cell, by the signal that `seconds` sends."""
+    cell = Cell("trajectory", "vices", 0)
+    place = Store(tmp_path)
+    saves = []
+    original = saving.Saver.save
+
+    def save(self, iteration, state, final):
+        original(self, iteration, state, final)
+        saves.append(iteration)
+        if iteration == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(saving.Saver, "save", save)
+    wanted = [cell]
+    assert work.run(place, TINY, wanted, QUIET) == 128 + signal.SIGTERM
+    assert 0 < max(saves) < 4
+    assert not place.holds(cells.definition(TINY.config(cell)), store.TRAINING, cell)
+    assert work.run(Store(tmp_path), TINY, wanted, QUIET) == 0
+    values = [
+        measures.of(
+            Store(p.folder).training, task=cell.task, variant=cell.variant, seed=0
+        ).select(pl.exclude("^time/.*$"))
+        for p in (place, grid[0])
+    ]
+    assert values[0].equals(values[1])
+    returns = [
+        measures.of(
+            Store(p.folder).episodes, task=cell.task, variant=cell.variant, seed=0
+        )["return"].to_list()
+        for p in (place, grid[0])
+    ]
+    assert returns[0] == returns[1]
+
+
+def test_a_run_whose_checkpoints_are_lost_begins_anew(grid, toy, tmp_path):
+    cell, place = Cell("push", "rmp_vices", 1), Store(tmp_path)
+    folder = place.folder / "runs" / cell.file
+    config = dataclasses.replace(TINY.config(cell), run_dir=str(folder))
+    _, lock = run_folder.open_run(config)
+    run_folder.describe(folder, config)
+    damaged = folder / run_folder.CHECKPOINTS / "2"
+    damaged.mkdir(parents=True)
+    (damaged / "_CHECKPOINT_METADATA").write_text("nonsense")
+    lock.close()
+    assert work.run(place, TINY, [cell], QUIET) == 0
+    assert len(Store(tmp_path).training) == 4
+
+
+def test_the_time_given_ends_in_a_signal():
+    stopped = threading.Event()
+    previous = signal.signal(signal.SIGTERM, lambda *_: stopped.set())
+    try:
+        with work._alarm(0.01):
+            assert stopped.wait(10.0)
+        stopped.clear()
+        with work._alarm(3600.0):
+            pass
+        assert not stopped.is_set()
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def test_pages_hold_every_target_and_every_figure(grid, pages):
+    text, document = (path.read_text() for path in pages)
+    found = targets.targets(grid[0])
+    assert len(found) == len(TASKS) * (3 + 4 * 2)
+    assert len({(t.claim, t.task) for t in found}) == len(found)
+    for target in found:
+        line = f"| {target.claim} | {TASKS[target.task]} | {target.measured or '-'} |"
+        assert line in text
+    figures = pages[0].parent / report.FIGURES
+    for name in ("training", "forces", "pareto", "robustness"):
+        assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<svg" in (figures / f"{name}.svg").read_text()
+        assert f"figures/{name}.png" in text
+    assert document.count("data:image/png;base64,") == text.count("](figures/")
+    assert "://" not in document  # self-contained
+
+
+def test_the_page_has_the_papers_numbers_beside_ours(grid, pages):
+    text = pages[0].read_text()
+    paper = published.DEPLOYMENT["vices"]["door"]
+    best = targets.best(grid[0], "door", "vices", "close")
+    hits = int((best["collision"] > 0).sum())
+    low, high = stats.binomtest(hits, 20).proportion_ci(method="exact")
+    share = f"{5.0 * hits:.1f} {tables.interval((100 * low, 100 * high))}"
+    (line,) = [
+        x
+        for x in text.splitlines()
+        if x.startswith("| door opening | VICES |") and "±" in x
+    ]
+    assert share in line
+    assert f"{paper.mean:,.0f} ± {paper.sd:,.0f}; 61; 36" in line
+
+
+def test_pages_are_the_same_from_the_store_alone(grid, pages, tmp_path):
+    again = report.write(Store(grid[0].folder), TINY, tmp_path)
+    assert [p.read_bytes() for p in again] == [p.read_bytes() for p in pages]
+
+
+def test_the_count_of_targets_is_that_of_the_tables_rows(pages):
+    text = next(p for p in pages if p.suffix == ".md").read_text()
+    counts = [text.count(f"| {word} |") for word in ("met", "NOT MET", "undecided")]
+    said = "Of {} targets {} are met, {} are not, and {} are undecided:"
+    assert sum(counts) == 33 and counts[2] < 33
+    assert said.format(33, *counts) in text
+
+
+def test_targets_without_measurements_are_said_to_be_unmeasured(grid):
+    empty = targets.targets(Store(grid[0].folder / "nothing"))
+    assert len(empty) == 33
+    assert {t.verdict for t in empty} == {"undecided"}
+
+
+def test_an_exported_policy_is_small_and_acts_the_same(grid, toy, tmp_path):
+    run = grid[0].folder / "runs" / Cell("door", "rmp_vices", 0).file
+    out = tmp_path / "pretrained" / "door-rmp_vices"
+    assert export.main([str(run), str(out)]) == 0
+    size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
+    assert size < 200_000
+    config = TINY.config(Cell("door", "rmp_vices", 0))
+    obs = jnp.ones((3, 2))
+    actions = [
+        load_agent(tasks.load(config), config, folder, True, pytest.fail)
+        for folder in (run, out)
+    ]
+    assert actions[0][0] == actions[1][0] == 4
+    key = jax.random.key(0)
+    np.testing.assert_array_equal(actions[0][1](obs, key), actions[1][1](obs, key))
+    assert export.main([str(run), str(out)]) == 2  # exists
+
+
+@pytest.mark.slow
+def test_the_smoke_preset_runs_end_to_end(root, tmp_path):
+    """The real tasks: minutes, nearly all of them compilation."""
+    folder = tmp_path / "store"
+    command = [sys.executable, "-m", "benchmarks.paper", "--preset", "smoke"]
+    subprocess.run([*command, "--folder", str(folder)], cwd=root, check=True)
+    assert (folder / "pages" / "index.html").stat().st_size > 100_000

@@ -1,0 +1,128 @@
+"""Our loss against Brax's on the same data."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training import types
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo import losses
+
+from rmp_mjx.training.learning.advantages import generalised_advantages
+from rmp_mjx.training.learning.loss import Batch, ppo_loss
+from rmp_mjx.training.learning.networks import make_networks
+from rmp_mjx.training.learning.rollout import Transition
+
+T, B, OBS, ACT = 4, 6, 3, 2
+
+
+@pytest.fixture(scope="module")
+def problem():
+    networks = make_networks(OBS, ACT, (8,), -0.5)
+    keys = jax.random.split(jax.random.key(0), 8)
+    obs = jax.random.normal(keys[0], (T + 1, B, OBS))
+    normalizer = running_statistics.init_state(jnp.zeros(OBS))
+    params = (
+        networks.policy_network.init(keys[1]),
+        networks.value_network.init(keys[2]),
+    )
+    raw = jax.random.normal(keys[3], (T, B, ACT))
+    old = networks.policy_network.apply(
+        normalizer, networks.policy_network.init(keys[4]), obs[:-1]
+    )
+    data = Transition(
+        obs=obs[:-1],
+        next_obs=obs[1:],
+        raw_action=raw,
+        log_prob=networks.parametric_action_distribution.log_prob(old, raw),
+        reward=jax.random.normal(keys[5], (T, B)),
+        termination=jnp.zeros((T, B)).at[1, 2].set(1.0),
+        truncation=jnp.zeros((T, B)),
+        weight=jnp.ones((T, B)),
+    )
+    return networks, normalizer, params, data, old
+
+
+def ours(params, problem, data):
+    networks, normalizer, start, _, _ = problem
+    values, following = (
+        networks.value_network.apply(normalizer, start[1], obs)
+        for obs in (data.obs, data.next_obs)
+    )
+    advantage = generalised_advantages(data, values, following, 0.9, 1.0)
+    batch = Batch(
+        obs=data.obs,
+        raw_action=data.raw_action,
+        log_prob=data.log_prob,
+        advantage=(advantage - advantage.mean()) / (advantage.std() + 1e-8),
+        target=values + advantage,
+        weight=data.weight,
+    )
+    batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    return ppo_loss(params, normalizer, batch, networks, 0.2, 0.01, 0.7)
+
+
+def test_loss_and_gradient_are_those_of_brax(problem):
+    networks, normalizer, params, data, old = problem
+
+    def brax(params):
+        swapped = types.Transition(
+            observation=data.obs,
+            action=data.raw_action,
+            reward=data.reward,
+            discount=1.0 - data.termination,
+            next_observation=data.next_obs,
+            extras={
+                "state_extras": {"truncation": data.truncation},
+                "policy_extras": {
+                    "raw_action": data.raw_action,
+                    "log_prob": data.log_prob,
+                    "distribution_params": old,
+                },
+            },
+        )
+        swapped = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), swapped)
+        return losses.compute_ppo_loss(
+            losses.PPONetworkParams(*params),
+            normalizer,
+            swapped,
+            jax.random.key(0),
+            networks,
+            entropy_cost=0.01,
+            discounting=0.9,
+            gae_lambda=1.0,  # Brax weighs its policy advantage otherwise below 1
+            clipping_epsilon=0.2,
+            vf_coefficient=0.7,
+        )[0]
+
+    both = jax.jit(
+        lambda p: (
+            jax.value_and_grad(lambda p: ours(p, problem, data)[0])(p),
+            jax.value_and_grad(brax)(p),
+        )
+    )
+    (value, grad), (brax_value, brax_grad) = both(params)
+    # float32 sums over 24 transitions in another order
+    np.testing.assert_allclose(value, brax_value, rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(grad), jax.tree.leaves(brax_grad), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_a_transition_of_weight_zero_has_no_influence(problem):
+    networks, normalizer, params, _, _ = problem
+    size = 6
+    batch = Batch(
+        obs=jnp.arange(size * OBS).reshape(size, OBS) / 10.0,
+        raw_action=jnp.ones((size, ACT)) / 3.0,
+        log_prob=-jnp.ones(size),
+        advantage=jnp.linspace(-1.0, 1.0, size),
+        target=jnp.linspace(0.0, 1.0, size),
+        weight=jnp.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0]),
+    )
+    kept = jax.tree.map(lambda x: x[:4], batch)
+    for one, two in zip(
+        jax.tree.leaves(ppo_loss(params, normalizer, batch, networks, 0.2, 0.1, 1.0)),
+        jax.tree.leaves(ppo_loss(params, normalizer, kept, networks, 0.2, 0.1, 1.0)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, two, rtol=1e-6)  # float32, sums with zeros

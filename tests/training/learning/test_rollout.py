@@ -1,0 +1,135 @@
+"""Rollouts: time limits, resets and episode statistics against a plain loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rmp_mjx.training.learning import rollout
+from tests.training import toys
+
+NUM_ENVS, LENGTH = 8, 12
+
+
+def act(obs, keys):
+    raw = jax.vmap(lambda key: jax.random.normal(key, (1,)))(keys)
+    return raw, {"raw_action": raw, "log_prob": raw[:, 0]}
+
+
+def unroll_twice(env):
+    def run(key):
+        keys = jax.random.split(key, NUM_ENVS)
+        others = jax.random.split(jax.random.key(7), NUM_ENVS)
+        state = rollout.init(env, keys)
+        state, first, a = rollout.unroll(env, act, state, keys, LENGTH)
+        _, second, b = rollout.unroll(env, act, state, others, LENGTH)
+        data = jax.tree.map(lambda *x: jnp.concatenate(x), first, second)
+        return data, rollout.total(jax.tree.map(jnp.add, a, b))
+
+    return jax.device_get(jax.jit(run)(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def counted():
+    return unroll_twice(toys.Counter())
+
+
+def replay(data):
+    """Episodes as a plain loop finds them: (return, length, truncated, effort)."""
+    episodes = []
+    for lane in range(NUM_ENVS):
+        total, steps, effort = 0.0, 0, []
+        for t in range(data.reward.shape[0]):
+            total, steps = total + data.reward[t, lane], steps + 1
+            effort.append(abs(float(data.raw_action[t, lane, 0])))
+            cut = data.truncation[t, lane] > 0
+            if data.termination[t, lane] > 0 or cut:
+                episodes.append((total, steps, cut, np.mean(effort)))
+                total, steps, effort = 0.0, 0, []
+    return episodes
+
+
+def test_episode_sums_equal_those_of_a_plain_loop(counted):
+    data, stats = counted
+    episodes = replay(data)
+    assert stats.episodes == len(episodes) > 20
+    # integers below 2^24: exact in float32
+    assert stats.episode_sums["return"] == sum(e[0] for e in episodes)
+    assert stats.episode_sums["length"] == sum(e[1] for e in episodes)
+    assert stats.episode_sums["collision"] == sum(not e[2] for e in episodes)
+    # sums of float32 means in another order
+    effort = sum(e[3] for e in episodes)
+    np.testing.assert_allclose(stats.episode_sums["effort"], effort, rtol=1e-5)
+
+
+def test_step_sums_count_events_of_all_steps(counted):
+    data, stats = counted
+    assert stats.step_sums["collision"] == data.termination.sum()
+
+
+def test_episodes_are_truncated_at_the_time_limit_and_only_there(counted):
+    data, _ = counted
+    step, length = data.next_obs[..., 1], data.obs[..., 0]
+    limit = toys.Counter().episode_length
+    np.testing.assert_array_equal(data.termination, step >= length)
+    np.testing.assert_array_equal(data.truncation, (step < length) & (step == limit))
+    assert data.truncation.sum() > 0
+
+
+def test_a_reset_draws_a_new_start_each_time(counted):
+    data, stats = counted
+    starts = {
+        (lane, float(data.obs[t, lane, 2]))
+        for t in range(data.obs.shape[0])
+        for lane in range(NUM_ENVS)
+    }
+    begun = {float(draw) for _, draw in starts}
+    assert len(begun) == len(starts) >= int(stats.episodes)
+
+
+def test_next_observation_is_that_before_the_reset(counted):
+    data, _ = counted
+    np.testing.assert_array_equal(data.next_obs[..., 1], data.obs[..., 1] + 1)
+    np.testing.assert_array_equal(data.next_obs[..., 2], data.obs[..., 2])
+
+
+def test_environments_go_on_across_unrolls(counted):
+    data, _ = counted
+    going_on = (data.termination + data.truncation)[LENGTH - 1] == 0
+    after, before = data.obs[LENGTH], data.next_obs[LENGTH - 1]
+    np.testing.assert_array_equal(after[going_on], before[going_on])
+
+
+def test_nonfinite_steps_are_masked_counted_and_reset():
+    data, stats = unroll_twice(toys.Exploding())
+    bad = data.obs[..., 0] > 0.5
+    assert stats.nonfinite == bad.sum() > 0
+    np.testing.assert_array_equal(data.weight, ~bad)
+    assert stats.episodes == (~bad).sum()
+    for leaf in jax.tree.leaves((data, stats)):
+        assert np.isfinite(leaf).all()
+
+
+def test_staggered_starts_spread_the_time_limit_and_count_whole_episodes_only():
+    """`Counter` ends an episode by itself or by the time limit."""
+    env = toys.Counter()
+    limit = env.episode_length
+
+    @jax.jit
+    def run(key):
+        keys = jax.random.split(key, 64)
+        state = rollout.init(env, keys, staggered=True)
+        _, data, stats = rollout.unroll(env, act, state, keys, 3 * limit)
+        return state, data, rollout.total(stats)
+
+    start, data, stats = jax.device_get(run(jax.random.key(0)))
+    assert len(np.unique(start.age)) == limit
+    ends = (data.truncation + data.termination) > 0
+    first = np.argmax(ends, axis=0)
+    np.testing.assert_array_equal(
+        first <= limit - 1 - start.age, np.ones_like(first, bool)
+    )
+    cut = np.take_along_axis(data.truncation, first[None], 0)[0] > 0
+    partial = cut & (start.age > 0)
+    assert partial.sum() > 10
+    assert stats.episodes == ends.sum() - partial.sum()

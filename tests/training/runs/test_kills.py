@@ -1,0 +1,139 @@
+"""Training processes that are killed at any moment, resumed, and compared."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import polars as pl
+import pytest
+
+from rmp_mjx.training.runs import run_folder
+from tests.training.runs import victim
+from tests.training.conftest import bits, newest_state, run
+
+PATIENCE = 120.0
+"""Seconds after which a process that says nothing counts as stuck."""
+LONGEST_SAVE = 0.15
+"""Seconds: a kill falls anywhere from the beginning of a save to past its end."""
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """An uninterrupted run: its configuration, last state and rows."""
+    folder = tmp_path_factory.mktemp("kills") / "reference"
+    _, config = run(folder, **victim.OPTIONS)
+    return config, last_state(folder, config), rows(folder)
+
+
+def last_state(folder, config):
+    step, state = newest_state(folder, config)
+    return step, jax.tree.map(bits, state)
+
+
+def rows(folder):
+    table = pl.read_parquet(folder / run_folder.METRICS)
+    return table.select(pl.exclude("^time/.*$"))
+
+
+class Victim:
+    """A training process; its lines can be waited for."""
+
+    def __init__(self, root, folder, *resume):
+        self.heard: list[tuple[str, int]] = []
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.training.runs.victim", str(folder), *resume],
+            cwd=root,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def _hear(self, line):
+        said, _, number = line.strip().partition(" ")
+        if number.isdecimal():  # libraries talk too
+            self.heard.append((said, int(number)))
+
+    def wait_for(self, word, at_least=0):
+        """Read on to `word N` with N at least this; False if it ends before."""
+        for line in self._process.stdout:
+            self._hear(line)
+            if any(w == word and n >= at_least for w, n in self.heard[-1:]):
+                return True
+        return False
+
+    def last(self, word):
+        return max((n for said, n in self.heard if said == word), default=0)
+
+    def send(self, number):
+        self._process.send_signal(number)
+
+    def end(self):
+        """Exit code and error output; what was said until then is heard."""
+        out, err = self._process.communicate(timeout=PATIENCE)
+        for line in out.splitlines():
+            self._hear(line)
+        return self._process.returncode, err
+
+
+def kill_and_resume(root, folder, reference, kills, chance):
+    """Kill the same run again and again; how many kills fell into a save."""
+    config, state, table = reference
+    acknowledged, resume, saving = 0, [], 0
+    for _ in range(kills):
+        process = Victim(root, folder, *resume)
+        assert process.wait_for("starting"), process.end()
+        # never less than what a process before has reported as saved
+        assert process.last("starting") >= acknowledged
+        within = chance.choice(("saving", "iteration"))
+        target = process.last("starting") + chance.randint(3, 7)
+        assert process.wait_for(within, target), process.end()
+        time.sleep(chance.uniform(0.0, LONGEST_SAVE))
+        process.send(signal.SIGKILL)
+        assert process.end()[0] == -signal.SIGKILL
+        saving += process.last("saving") > process.last("saved")
+        acknowledged, resume = max(acknowledged, process.last("saved")), ["resume"]
+    process = Victim(root, folder, *resume)
+    code, error = process.end()
+    assert code == 0, error
+    assert process.last("starting") >= acknowledged
+    assert last_state(folder, config) == state
+    assert rows(folder).equals(table)
+    names = [p.name for p in (folder / run_folder.CHECKPOINTS).iterdir()]
+    assert all(name.isdecimal() for name in names), f"left behind: {names}"
+    return saving
+
+
+def test_a_run_killed_twice_ends_as_if_nothing_had_happened(root, reference, tmp_path):
+    kill_and_resume(root, tmp_path / "run", reference, 2, random.Random(0))
+
+
+@pytest.mark.slow
+def test_a_run_killed_twenty_times_ends_as_if_nothing_had_happened(
+    root, reference, tmp_path, capsys
+):
+    kills = int(os.environ.get("RMP_MJX_KILLS", "20"))
+    done = saving = 0
+    while done < kills:  # a run has room for eight kills
+        some = min(8, kills - done)
+        folder = tmp_path / str(done)
+        saving += kill_and_resume(root, folder, reference, some, random.Random(done))
+        done += some
+    with capsys.disabled():
+        sys.stdout.write(f"{kills} kills, {saving} of them during a save\n")
+    assert saving > 0
+
+
+def test_a_terminated_process_saves_says_how_to_resume_and_exits_with_143(
+    root, tmp_path
+):
+    process = Victim(root, tmp_path / "run")
+    assert process.wait_for("iteration", 3), process.end()
+    process.send(signal.SIGTERM)
+    code, error = process.end()
+    assert code == 128 + signal.SIGTERM
+    assert "stopping after this iteration" in error
+    assert process.last("saved") == process.last("iteration") < victim.ITERATIONS
