@@ -81,7 +81,6 @@ bench-gate: $(STAMP)
 	$(PY) -m benchmarks.gate $(ARGS)
 
 docs: $(STAMP)
-	$(PY) $(PIP) -c requirements.lock -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
 # Python 3.12 and the newest release of everything.

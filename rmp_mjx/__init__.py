@@ -25,4 +25,4 @@ from rmp_mjx.types import Action as Action
 from rmp_mjx.types import ControlOutput as ControlOutput
 from rmp_mjx.types import Setpoint as Setpoint
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
