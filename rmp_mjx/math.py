@@ -16,8 +16,8 @@ def psd_solve(
 ) -> Float[Array, " n"] | Float[Array, "n k"]:
     r"""Solve ``A x = b`` for a small symmetric positive (semi-)definite ``A``.
 
-    A hand-unrolled :math:`L D L^T` factorisation after Jacobi scaling
-    :math:`A_{ij} / \sqrt{A_{ii} A_{jj}}`. It calls no LAPACK, so a batch of solves
+    A hand-unrolled $L D L^T$ factorisation after Jacobi scaling
+    $A_{ij} / \sqrt{A_{ii} A_{jj}}$. It calls no LAPACK, so a batch of solves
     vectorises under `jax.vmap`. The scaling makes the accuracy independent of the
     units of the rows. Pivots are clamped at ``n`` machine epsilons (of the scaled
     matrix, whose diagonal is one): a singular matrix gives a finite answer, not NaN.
@@ -153,7 +153,7 @@ def exp_so3(w: Float[Array, " 3"]) -> Float[Array, "3 3"]:
         w: Rotation vector, (3,), [rad].
 
     Returns:
-        :math:`\exp([w]_\times)`, (3, 3).
+        $\exp([w]_\times)$, (3, 3).
     """
     theta2 = jnp.sum(w * w)
     small = theta2 < 1e-4
@@ -193,9 +193,9 @@ def log_so3(R: Float[Array, "3 3"]) -> Float[Array, " 3"]:
 def orientation_error(
     R: Float[Array, "3 3"], R_des: Float[Array, "3 3"]
 ) -> Float[Array, " 3"]:
-    r"""Orientation error :math:`e_r = \tfrac12 \sum_i r_i \times r_{g,i}`.
+    r"""Orientation error $e_r = \tfrac12 \sum_i r_i \times r_{g,i}$.
 
-    Equal to :math:`\sin\theta` times the world-frame axis of the rotation that takes
+    Equal to $\sin\theta$ times the world-frame axis of the rotation that takes
     ``R`` to ``R_des``: a positive gain on it converges. It shrinks again beyond 90
     degrees and vanishes at 180.
 
@@ -212,7 +212,7 @@ def orientation_error(
 
 
 def speed_gate(speed: Float[Array, "*s"], sigma: Float[Array, ""] | float):
-    r"""Smooth gate :math:`1 - \exp(-v^2 / 2 \sigma^2)`: 0 at rest, 1 when fast.
+    r"""Smooth gate $1 - \exp(-v^2 / 2 \sigma^2)$: 0 at rest, 1 when fast.
 
     Args:
         speed: Speeds, any shape, in the unit of ``sigma``.

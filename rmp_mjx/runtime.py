@@ -2,7 +2,7 @@
 
 A library must not touch the process it is imported into, so nothing here runs at
 import. ``train.py``, ``eval.py``, the benchmarks and the test suite call
-:func:`configure` once, before JAX opens its backend.
+`configure` once, before JAX opens its backend.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _GL_CONTEXT_MODULES = (
 
 @dataclass(frozen=True)
 class Runtime:
-    """What :func:`configure` found or set for this process."""
+    """What `configure` found or set for this process."""
 
     xla_flags: str
     """Value of ``XLA_FLAGS`` that the JAX backend starts with."""

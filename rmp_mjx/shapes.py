@@ -1,14 +1,15 @@
 r"""Shapes of obstacles in padded slots, and their distance to control points.
 
 Every curved obstacle is a core (point, segment, box) inflated by a radius. With
-:math:`g` the vector from the nearest core point and :math:`\dot g` its rate,
+$g$ the vector from the nearest core point and $\dot g$ its rate,
 
-.. math::
-    d = |g| - r, \quad \hat n = g / |g|, \quad \dot d = \hat n \cdot \dot g, \quad
-    \ddot d = \hat n \cdot \ddot x + c, \quad
-    c = \hat n \cdot b + (|\dot g|^2 - \dot d^2) / |g|
+$$
+d = |g| - r, \quad \hat n = g / |g|, \quad \dot d = \hat n \cdot \dot g, \quad
+\ddot d = \hat n \cdot \ddot x + c, \quad
+c = \hat n \cdot b + (|\dot g|^2 - \dot d^2) / |g|
+$$
 
-where :math:`\ddot x` is the control point's acceleration and b the Coriolis and
+where $\ddot x$ is the control point's acceleration and b the Coriolis and
 centripetal terms of a rotating obstacle. The gradient is a unit normal everywhere.
 """
 

@@ -112,11 +112,12 @@ def self_gaps(
     r"""Distances of the k pairs of link capsules that can touch.
 
     The distance of two capsules depends on the joints between them only: with the
-    unit force along the gap, :math:`w = (\hat n, p \times \hat n)`,
+    unit force along the gap, $w = (\hat n, p \times \hat n)$,
 
-    .. math::
-        \dot d = w \cdot (V_a - V_b), \quad
-        \ddot d = w^T S_{ab}\, \ddot q + w \cdot (A_a - A_b) + \dot w \cdot (V_a - V_b).
+    $$
+    \dot d = w \cdot (V_a - V_b), \quad
+    \ddot d = w^T S_{ab}\, \ddot q + w \cdot (A_a - A_b) + \dot w \cdot (V_a - V_b).
+    $$
 
     Returns:
         Distance [m], rate [m/s], the acceleration's part without qdd [m/s^2], gradient.

@@ -50,16 +50,17 @@ class Barriers(NamedTuple):
 class FilteredVICES(VICES):
     r"""The acceleration that VICES' torques give, changed as little as safety needs.
 
-    .. math::
-        \min_{\ddot q} \|\ddot q - \ddot q_{VICES}\|^2_{M_q}
-        \quad \text{s.t.} \quad
-        \ddot d_i + 2 \alpha \dot d_i + \alpha^2 d_i \ge 0, \quad
-        |M_q \ddot q + b| \le \tau_{max}
+    $$
+    \min_{\ddot q} \|\ddot q - \ddot q_{VICES}\|^2_{M_q}
+    \quad \text{s.t.} \quad
+    \ddot d_i + 2 \alpha \dot d_i + \alpha^2 d_i \ge 0, \quad
+    |M_q \ddot q + b| \le \tau_{max}
+    $$
 
     with a barrier on the distance of every control point to every obstacle, of the
     links' capsules to each other, and of every joint to its limits: the same points,
     obstacles and margins as `RMPVICES`. They have relative degree 2; the gains put both
-    poles at :math:`-\alpha`, so that a distance decays without overshoot. Where not all
+    poles at $-\alpha$, so that a distance decays without overshoot. Where not all
     can hold, each is violated at a cost that grows with its square (see `project`),
     and the torque is clipped in the end.
 

@@ -17,7 +17,7 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
     r"""RMP-VICES with the formulas of the paper, their signs corrected, no additions.
 
     The two impedance attractors (metric 1, never yielding), its collision leaf
-    :math:`m = \max(-\dot x, 0)^2 / x^4, \; a = -\eta \dot x`, and RMPflow's joint
+    $m = \max(-\dot x, 0)^2 / x^4, \; a = -\eta \dot x$, and RMPflow's joint
     limiter at its authors' values. No posture leaf, no self-collision leaf, no
     curvature, floor, margin or range. It is here to be compared with: nothing in it
     resists a slow push, at rest its joint limiter weighs 0.01 everywhere, and its null
@@ -26,13 +26,13 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
     What cannot be literal, and why:
 
     * Signs: as printed the attractor repels, the collision leaf acts on leaving and
-      accelerates. The leaf's output is the force :math:`f = m a` that a pullback adds.
-    * The root: :math:`\ddot q = M^+ f` jumps where the rank of M changes and in float32
+      accelerates. The leaf's output is the force $f = m a$ that a pullback adds.
+    * The root: $\ddot q = M^+ f$ jumps where the rank of M changes and in float32
       drops the attractors beside an obstacle. Instead `RMPVICES`' resolve with the
       least power of ten that float32 can do with (`REGULARIZER`).
-    * :math:`x^{-4}` has no value at contact: x is clamped at 5 mm and the metric at
+    * $x^{-4}$ has no value at contact: x is clamped at 5 mm and the metric at
       1e5, the number in the authors' related code.
-    * :math:`\eta` and the control points were not published: 2/s, from the range in
+    * $\eta$ and the control points were not published: 2/s, from the range in
       the authors' related code, and a point every 5 cm or less on every link.
 
     Args:

@@ -21,10 +21,11 @@ def project(
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     r"""The quadratic program of a projection, with a penalty for its constraints.
 
-    .. math::
-        \min_x \tfrac12 \|x\|^2 + \tfrac{\rho}{2} \sum_j \max(0, g_j \cdot x - h_j)^2
+    $$
+    \min_x \tfrac12 \|x\|^2 + \tfrac{\rho}{2} \sum_j \max(0, g_j \cdot x - h_j)^2
+    $$
 
-    by Newton's method: the Hessian is :math:`I + \rho \sum g_j g_j^T` over the
+    by Newton's method: the Hessian is $I + \rho \sum g_j g_j^T$ over the
     violated constraints, and the best of `STEPS` along the step makes it descend. The
     cost is strictly convex and quadratic in pieces, of which the method visits a few.
 

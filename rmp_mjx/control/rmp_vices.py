@@ -46,11 +46,12 @@ class RMPVICES(Pytree):
     One call evaluates the tree at (q, qd), resolves its root in the inertia metric and
     turns the acceleration into torque:
 
-    .. math::
-        (M + \epsilon M_q)\, \ddot q = f, \qquad \tau = b + k\, M_q \ddot q .
+    $$
+    (M + \epsilon M_q)\, \ddot q = f, \qquad \tau = b + k\, M_q \ddot q .
+    $$
 
     The inertia-weighted regulariser makes the tree without its safety leaves converge
-    to (coupled) operational-space control as :math:`\epsilon \to 0`; the paper's
+    to (coupled) operational-space control as $\epsilon \to 0$; the paper's
     Moore-Penrose inverse does not. The controller is a pytree: gains and leaf
     parameters are array leaves that can be traced, vmapped, differentiated and tuned.
 

@@ -16,9 +16,11 @@ RATIOS = (1.0, 0.618, 0.382)
 class Stirring(Pytree):
     r"""Displacement of the set-point beside an obstacle, at clearance c and time t.
 
-    .. math:: A\, s\, e^{-|v|^2 / v_0^2}
-        \bigl(\sin \omega t, \sin 0.618\, \omega t, \sin 0.382\, \omega t \bigr), \quad
-        s = \mathrm{clip}\Bigl(\frac{c_{far} - c}{c_{far} - c_{near}}, 0, 1\Bigr)
+    $$
+    A\, s\, e^{-|v|^2 / v_0^2}
+    \bigl(\sin \omega t, \sin 0.618\, \omega t, \sin 0.382\, \omega t \bigr), \quad
+    s = \mathrm{clip}\Bigl(\frac{c_{far} - c}{c_{far} - c_{near}}, 0, 1\Bigr)
+    $$
 
     A tree is a function of the state: where its forces balance it rests for good, and
     a policy that acts on the state with it. The time breaks the balance.

@@ -11,7 +11,9 @@ def scale_torque(
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     r"""Torque within the limits that keeps the direction of the acceleration.
 
-    .. math:: \tau = b + k\, M_q \ddot q, \quad k \in [0, 1] \text{ as large as fits.}
+    $$
+    \tau = b + k\, M_q \ddot q, \quad k \in [0, 1] \text{ as large as fits.}
+    $$
 
     Clipping each joint by itself would turn the acceleration away from what the tree
     asked for, into an obstacle if it must be. A bias beyond the limits is clipped.

@@ -20,13 +20,14 @@ from rmp_mjx.types import Action, ControlOutput, Setpoint
 class VICES(Pytree):
     r"""Decoupled operational-space impedance control (paper, eq. 2).
 
-    .. math::
-        \tau = J_p^T \Lambda_p (k_p (p_{des} - p) - k_d v)
-             + J_o^T \Lambda_o (k_p\, e_r(R, R_{des}) - k_d \omega)
-             + N^T M_q \ddot q_0 + b
+    $$
+    \tau = J_p^T \Lambda_p (k_p (p_{des} - p) - k_d v) +
+    J_o^T \Lambda_o (k_p\, e_r(R, R_{des}) - k_d \omega) +
+    N^T M_q \ddot q_0 + b
+    $$
 
-    with critical damping, :math:`\Lambda = (J M_q^{-1} J^T)^{-1}` of each block by
-    itself, a posture acceleration :math:`\ddot q_0` in the dynamically consistent
+    with critical damping, $\Lambda = (J M_q^{-1} J^T)^{-1}$ of each block by
+    itself, a posture acceleration $\ddot q_0$ in the dynamically consistent
     null space (gains 10 and 2 sqrt(10), as in VICES' code), and torques clipped joint
     by joint. It takes obstacles and ignores them.
     """

@@ -11,8 +11,10 @@ from rmp_mjx.pytree import Pytree
 class Yielding(Pytree):
     r"""Weight of the orientation attractor where an obstacle or a limit leaves room c.
 
-    .. math:: h = h_{least}^{\,s}, \quad
-        s = \mathrm{clip}\Bigl(\frac{c_{far} - c}{c_{far} - c_{near}}, 0, 1\Bigr)
+    $$
+    h = h_{least}^{\,s}, \quad
+    s = \mathrm{clip}\Bigl(\frac{c_{far} - c}{c_{far} - c_{near}}, 0, 1\Bigr)
+    $$
 
     The identity metrics of the two attractors weigh 1 rad/s^2 like 1 m/s^2, so a hand
     that meets an obstacle would rather stop than turn by a degree. With ``least`` the

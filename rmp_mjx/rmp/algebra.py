@@ -35,7 +35,9 @@ class RMP(Pytree):
 def pullback(rmp: RMP, J: Float[Array, "m n"], Jdot_qd: Float[Array, " m"]) -> RMP:
     r"""Pull a child RMP back through its task map (RMPflow, natural form).
 
-    .. math:: f = J^T (f_c - M_c \dot J \dot q), \quad M = J^T M_c J.
+    $$
+    f = J^T (f_c - M_c \dot J \dot q), \quad M = J^T M_c J.
+    $$
 
     Args:
         rmp: Child RMP; f (m,), M (m, m).
@@ -60,7 +62,9 @@ def resolve(
 ) -> Float[Array, " n"]:
     r"""Acceleration of the root RMP, with an explicit regulariser.
 
-    .. math:: (M + W)\, \ddot q = f + W \ddot q_0.
+    $$
+    (M + W)\, \ddot q = f + W \ddot q_0.
+    $$
 
     With ``W = eps * Mq`` (inertia) and ``qdd_0`` a posture acceleration, small ``eps``
     gives operational-space control with a dynamically consistent null space. Without

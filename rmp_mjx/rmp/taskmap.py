@@ -64,9 +64,10 @@ class Pushed(Pytree):
 def pushforward(psi: TaskMap, x: Float[Array, " n"], xd: Float[Array, " n"]) -> Pushed:
     r"""Push a state through a task map.
 
-    .. math::
-        y = \psi(x, p), \quad \dot y = J \dot x + \partial_p \psi\, \dot p, \quad
-        \ddot y = J \ddot x + \tfrac{d^2}{dt^2} \psi(x + t \dot x, p + t \dot p)|_0
+    $$
+    y = \psi(x, p), \quad \dot y = J \dot x + \partial_p \psi\, \dot p, \quad
+    \ddot y = J \ddot x + \tfrac{d^2}{dt^2} \psi(x + t \dot x, p + t \dot p)|_0
+    $$
 
     The last term, ``Jdot_qd``, is a second-order forward derivative (nested jvp). It
     is exact; parameters are taken to move at constant velocity.

@@ -1,16 +1,17 @@
 r"""Kinematics of the chain in closed form, in spatial vectors.
 
 All spatial vectors are about one fixed point (the first joint's reference position)
-with axes of the world, linear part first: a twist :math:`V = (v_0, \omega)` gives the
-body point at x the velocity :math:`v_0 + \omega \times x`. In these coordinates every
+with axes of the world, linear part first: a twist $V = (v_0, \omega)$ gives the
+body point at x the velocity $v_0 + \omega \times x$. In these coordinates every
 link sees the same joint columns S, so twists and accelerations are running sums, and
 pulling wrenches and metrics back to the joints needs only sums over outer links:
 
-.. math::
-    V_i = \sum_{j \le i} S_j \dot q_j, \quad
-    A_i = \sum_{j \le i} (V_j \times S_j) \dot q_j, \quad
-    f_j = S_j^T \sum_{i \ge j} w_i, \quad
-    M_{jk} = S_j^T \Bigl(\sum_{i \ge \max(j,k)} M_i\Bigr) S_k .
+$$
+V_i = \sum_{j \le i} S_j \dot q_j, \quad
+A_i = \sum_{j \le i} (V_j \times S_j) \dot q_j, \quad
+f_j = S_j^T \sum_{i \ge j} w_i, \quad
+M_{jk} = S_j^T \Bigl(\sum_{i \ge \max(j,k)} M_i\Bigr) S_k .
+$$
 
 The last two are the recursive Newton-Euler and composite-rigid-body algorithms
 (Featherstone, 2008), used here for inertias and for RMP metrics alike. They equal
@@ -139,7 +140,7 @@ def joint_forces(S: Motion, W: Float[Array, "6 n"]) -> Float[Array, " n"]:
 
 
 def joint_metric(S: Motion, F: Motion) -> Float[Array, "n n"]:
-    r"""Joint-space metric :math:`S_j \cdot F_k` from composite momenta.
+    r"""Joint-space metric $S_j \cdot F_k$ from composite momenta.
 
     Column k of F is the composite 6x6 metric of links >= k times joint column k.
     """

@@ -74,11 +74,13 @@ def pull_to_joints(
 ) -> RMP:
     r"""Pull the points' RMPs back to the joints (RMPflow pullback, natural form).
 
-    Each point's :math:`f - M \dot J \dot q` and M become a wrench and a 6x6 metric
+    Each point's $f - M \dot J \dot q$ and M become a wrench and a 6x6 metric
     about the base point,
 
-    .. math:: \begin{pmatrix} M & M [x]_\times^T \\ [x]_\times M &
-        [x]_\times M [x]_\times^T \end{pmatrix},
+    $$
+    \begin{pmatrix} M & M [x]_\times^T \\ [x]_\times M &
+    [x]_\times M [x]_\times^T \end{pmatrix},
+    $$
 
     which are summed over all points that move with or beyond each joint and then
     contracted with the joint columns.

@@ -42,9 +42,11 @@ def orientation_attractor(
     kd: Float[Array, " 3"] | Float[Array, ""] | float | None = None,
     weight: Float[Array, ""] | float = 1.0,
 ) -> RMP:
-    r"""Orientation impedance on the angular velocity: metric I on :math:`\omega`.
+    r"""Orientation impedance on the angular velocity: metric I on $\omega$.
 
-    .. math:: \alpha = k_p\, e_r(R, R_{des}) - k_d\, \omega.
+    $$
+    \alpha = k_p\, e_r(R, R_{des}) - k_d\, \omega.
+    $$
 
     Pull it back with the angular Jacobian (world frame) and its bias ``Jdot qd``.
 
@@ -71,14 +73,16 @@ class OrientationAttractor(Leaf):
 
     Its node coordinate is the rotation matrix itself, row by row: ``x = R.reshape(9)``,
     so the task map is just ``q -> R(q)``, with no chart and no singularity. Embedding
-    the metric :math:`W = w I` and the torque :math:`\tau` of `orientation_attractor` as
+    the metric $W = w I$ and the torque $\tau$ of `orientation_attractor` as
 
-    .. math:: M = \tfrac14 B W B^T, \quad f = \tfrac12 B \tau, \quad
-        B\,\omega = \mathrm{vec}([\omega]_\times R), \quad B^T B = 2 I
+    $$
+    M = \tfrac14 B W B^T, \quad f = \tfrac12 B \tau, \quad
+    B\,\omega = \mathrm{vec}([\omega]_\times R), \quad B^T B = 2 I
+    $$
 
-    makes the pullback to q exactly :math:`J_\omega^T W J_\omega` and
-    :math:`J_\omega^T (\tau - W \dot J_\omega \dot q)`: the centripetal part
-    :math:`[\omega]^2 R` of the curvature is orthogonal to B's range.
+    makes the pullback to q exactly $J_\omega^T W J_\omega$ and
+    $J_\omega^T (\tau - W \dot J_\omega \dot q)$: the centripetal part
+    $[\omega]^2 R$ of the curvature is orthogonal to B's range.
     """
 
     R_des: Float[Array, "3 3"]

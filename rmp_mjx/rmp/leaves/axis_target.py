@@ -14,9 +14,9 @@ class AxisTarget(Leaf):
     r"""Attract a unit axis carried by a body to a direction of the world.
 
     The node coordinate is the axis itself, ``x = R(q) a`` in R^3, so the task map is
-    ``q -> R(q) @ a``. The pull is :math:`a = k_p (d - x) - k_d \dot x` with metric I;
+    ``q -> R(q) @ a``. The pull is $a = k_p (d - x) - k_d \dot x$ with metric I;
     its part along x is orthogonal to every motion of the axis and drops out of the
-    pullback, which leaves :math:`k_p \sin\theta` towards the direction.
+    pullback, which leaves $k_p \sin\theta$ towards the direction.
 
     Source: Li et al., "RMP2" (2021), axis-attractor policy; Lula's axis target.
     """

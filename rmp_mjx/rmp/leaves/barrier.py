@@ -11,20 +11,23 @@ from rmp_mjx.rmp.leaf import ScalarLeaf
 class Barrier(ScalarLeaf):
     r"""Velocity-gated barrier on a signed distance ``d`` with speed ``xd = dd/dt``.
 
-    With :math:`x = \max(d - \text{margin}, x_\min)`, the approach
-    :math:`v = \min(\dot x, 0)` and :math:`h = \exp(-\max(\dot x, 0) / v_\text{out})`,
-    for :math:`x < r`:
+    With $x = \max(d - \text{margin}, x_\min)$, the approach
+    $v = \min(\dot x, 0)$ and $h = \exp(-\max(\dot x, 0) / v_\text{out})$,
+    for $x < r$:
 
-    .. math::
-        m &= h \min\bigl(\mu (1 - x/r)^2 (v^2 + \epsilon) / x^4,\ \text{cap}\bigr) \\
-        a &= -\eta v + v^2 / x + k_{out} \max(\text{margin} - d, 0) \\
-        f &= m a
+    $$
+    \begin{split}
+    m &= h \min\bigl(\mu (1 - x/r)^2 (v^2 + \epsilon) / x^4,\ \text{cap}\bigr) \\
+    a &= -\eta v + v^2 / x + k_{out} \max(\text{margin} - d, 0) \\
+    f &= m a
+    \end{split}
+    $$
 
-    and exactly zero otherwise. The :math:`v^2 / x` term is the geodesic curvature of
-    the metric :math:`v^2 / x^4`; ``eps`` keeps a slowly creeping approach heavy.
+    and exactly zero otherwise. The $v^2 / x$ term is the geodesic curvature of
+    the metric $v^2 / x^4$; ``eps`` keeps a slowly creeping approach heavy.
 
     A body that leaves is let go over the speed ``v_out``. To let go at once, at
-    :math:`\dot x = 0`, makes a ratchet: when a body that is pushed against the barrier
+    $\dot x = 0$, makes a ratchet: when a body that is pushed against the barrier
     drifts off it, the metric is gone for one control step, the push throws the body
     inwards, and each time it stops a little closer. Explicit integration of the damping
     needs ``eta * dt < 2``.

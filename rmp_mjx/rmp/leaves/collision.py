@@ -26,9 +26,9 @@ def collision_near() -> Barrier:
 class PaperCollision(ScalarLeaf):
     r"""The collision leaf in the paper's form, with switchable signs.
 
-    ``signs="corrected"``: :math:`m = \max(-\dot x, 0)^2 / x^4`,
-    :math:`a = -\eta \dot x`. ``signs="as_printed"`` reproduces the printed formulas,
-    gate :math:`\max(\dot x, 0)` and :math:`a = +\eta \dot x`, which are wrong for a
+    ``signs="corrected"``: $m = \max(-\dot x, 0)^2 / x^4$,
+    $a = -\eta \dot x$. ``signs="as_printed"`` reproduces the printed formulas,
+    gate $\max(\dot x, 0)$ and $a = +\eta \dot x$, which are wrong for a
     distance that is positive outside: for ablations only. In both, f = m a.
 
     Source: Shaw et al. (2021), the collision-avoidance leaf.
@@ -67,20 +67,21 @@ class PaperCollision(ScalarLeaf):
 class GDSCollision(ScalarLeaf):
     r"""The geodesic (GDS) form: metric, curvature, damping and optional potential.
 
-    With :math:`x = \max(d - \text{margin}, x_\min)`,
-    :math:`w = \mu \max(1 - x/r, 0)^2 / x^4`,
-    :math:`u = \epsilon + \max(-\dot x, 0)^2`, :math:`g = u w` and the potential
-    :math:`\Phi = \tfrac12 \alpha w`:
+    With $x = \max(d - \text{margin}, x_\min)$,
+    $w = \mu \max(1 - x/r, 0)^2 / x^4$,
+    $u = \epsilon + \max(-\dot x, 0)^2$, $g = u w$ and the potential
+    $\Phi = \tfrac12 \alpha w$:
 
-    .. math::
-        M = g + \tfrac12 \dot x\, w\, u', \quad
-        \xi = \tfrac12 \dot x^2 u\, w', \quad
-        f = -\eta g \dot x - \xi - \Phi'
+    $$
+    M = g + \tfrac12 \dot x\, w\, u', \quad
+    \xi = \tfrac12 \dot x^2 u\, w', \quad
+    f = -\eta g \dot x - \xi - \Phi'
+    $$
 
     Undamped, with eps = alpha = 0 and r = inf, an approaching mass obeys
-    :math:`\ddot x = \dot x^2 / x`: its speed falls in proportion to the distance. Below
+    $\ddot x = \dot x^2 / x$: its speed falls in proportion to the distance. Below
     the cap, a tree of such leaves loses energy
-    :math:`\tfrac12 g \dot x^2 + \Phi` at the rate :math:`\eta g \dot x^2`. Beyond it
+    $\tfrac12 g \dot x^2 + \Phi$ at the rate $\eta g \dot x^2$. Beyond it
     f and M are scaled together: the leaf's own acceleration is unchanged.
 
     Source: Cheng et al., "RMPflow" (2018), geometric dynamical systems.
@@ -128,11 +129,14 @@ class GDSCollision(ScalarLeaf):
 class LulaCollision(ScalarLeaf):
     r"""The collision leaf of NVIDIA's Lula RMPflow, with its Franka defaults.
 
-    .. math::
-        a &= k_p e^{-x/l_p} - k_d (1 - \mathrm{sigmoid}(\dot x/v_d))
-             \frac{\dot x}{x/l_d + e_d} \\
-        m &= (1 - \mathrm{sigmoid}(\dot x/v_d)) (1 - x/r)^2
-             \frac{\mu}{x/l_m + e_m}, \quad x < r
+    $$
+    \begin{split}
+    a &= k_p e^{-x/l_p} - k_d (1 - \mathrm{sigmoid}(\dot x/v_d))
+    \frac{\dot x}{x/l_d + e_d} \\
+    m &= (1 - \mathrm{sigmoid}(\dot x/v_d)) (1 - x/r)^2
+    \frac{\mu}{x/l_m + e_m}, \quad x < r
+    \end{split}
+    $$
 
     Its damping reaches ``kd / ed`` = 5000/s near contact, which chatters at control
     periods of a few milliseconds.

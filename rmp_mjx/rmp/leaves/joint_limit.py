@@ -49,14 +49,17 @@ def _span(lower: Array, upper: Array) -> tuple[Array, Array, Array]:
 class RMPflowJointLimit(ScalarLeaf):
     r"""The velocity-gated joint-limit metric of RMPflow, as its authors code it.
 
-    With :math:`s = (q - l)/(u - l)`, :math:`d = 4 s (1 - s)` and gates
-    :math:`\alpha_u = 1 - \exp(-\max(\dot q, 0)^2 / 2\sigma^2)` (:math:`\alpha_l` with
+    With $s = (q - l)/(u - l)$, $d = 4 s (1 - s)$ and gates
+    $\alpha_u = 1 - \exp(-\max(\dot q, 0)^2 / 2\sigma^2)$ ($\alpha_l$ with
     min):
 
-    .. math::
-        b &= s (\alpha_u d + 1 - \alpha_u) + (1 - s)(\alpha_l d + 1 - \alpha_l) \\
-        m &= \lambda b^{-2}, \quad f = m (\gamma_p (q_0 - q) - \gamma_d \dot q) - \xi,
-        \quad \xi = \tfrac12 \lambda \, \partial_q b^{-2} \, \dot q^2
+    $$
+    \begin{split}
+    b &= s (\alpha_u d + 1 - \alpha_u) + (1 - s)(\alpha_l d + 1 - \alpha_l) \\
+    m &= \lambda b^{-2}, \quad f = m (\gamma_p (q_0 - q) - \gamma_d \dot q) - \xi,
+    \quad \xi = \tfrac12 \lambda \, \partial_q b^{-2} \, \dot q^2
+    \end{split}
+    $$
 
     It is a brake that acts on fast joints, not a wall: at rest the metric is
     ``lambda`` everywhere. Joints without two finite limits contribute nothing.
@@ -109,11 +112,12 @@ class LulaJointLimit(ScalarLeaf):
     r"""The joint-limit leaf of NVIDIA's Lula RMPflow, one policy per range end.
 
     On the distance to a limit normalised by the joint's range, with speed
-    :math:`\dot x`:
+    $\dot x$:
 
-    .. math::
-        a = \frac{k_p}{x^2 / l_p^2 + e_p} - k_d \dot x, \qquad
-        m = (1 - \mathrm{sigmoid}(\dot x / v_m)) \frac{\mu}{x / l_m + e_m},
+    $$
+    a = \frac{k_p}{x^2 / l_p^2 + e_p} - k_d \dot x, \qquad
+    m = (1 - \mathrm{sigmoid}(\dot x / v_m)) \frac{\mu}{x / l_m + e_m},
+    $$
 
     pulled back to the joint through the (constant) normalisation. Joints without two
     finite limits contribute nothing. Defaults are those of the Franka configuration.

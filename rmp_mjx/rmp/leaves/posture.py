@@ -11,7 +11,7 @@ from rmp_mjx.rmp.leaf import Leaf
 
 
 class Posture(Leaf):
-    r"""Spring and damper in joint space, :math:`a = k_q (q_0 - q) - k_d \dot q`.
+    r"""Spring and damper in joint space, $a = k_q (q_0 - q) - k_d \dot q$.
 
     Used as a leaf its metric is ``weight`` times the identity, or times the inertia
     given at the call. Used as ``resolve``'s ``qdd_0`` only `acceleration` matters.

@@ -11,11 +11,12 @@ from rmp_mjx.rmp.leaf import ScalarLeaf
 class VelocityCap(ScalarLeaf):
     r"""Damping whose metric grows without bound as the speed reaches its limit.
 
-    With :math:`s = (|\dot q| - (v_\max - \delta)) / \delta`, for s > 0:
+    With $s = (|\dot q| - (v_\max - \delta)) / \delta$, for s > 0:
 
-    .. math::
-        m = \min\Bigl(w \frac{s^2}{1 - s^2}, \text{cap}\Bigr), \qquad
-        a = -k\, \mathrm{sign}(\dot q)\, s\, \delta
+    $$
+    m = \min\Bigl(w \frac{s^2}{1 - s^2}, \text{cap}\Bigr), \qquad
+    a = -k\, \mathrm{sign}(\dot q)\, s\, \delta
+    $$
 
     and zero below the damping region; at and beyond the limit the metric is the cap.
     Explicit integration needs ``gain * dt < 2``.

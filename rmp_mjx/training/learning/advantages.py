@@ -16,11 +16,13 @@ def generalised_advantages(
 ) -> Float[Array, "t b"]:
     r"""Advantages of Schulman et al. (2016), equation 16.
 
-    .. math:: A_t = \delta_t + \gamma\lambda (1 - d_t) A_{t+1}, \quad
-        \delta_t = r_t + \gamma (1 - e_t) V(o'_t) - V(o_t)
+    $$
+    A_t = \delta_t + \gamma\lambda (1 - d_t) A_{t+1}, \quad
+    \delta_t = r_t + \gamma (1 - e_t) V(o'_t) - V(o_t)
+    $$
 
-    with :math:`e` the terminations, :math:`d` terminations and truncations, and
-    :math:`o'` the observation before a reset: a time limit is not an end.
+    with $e$ the terminations, $d$ terminations and truncations, and
+    $o'$ the observation before a reset: a time limit is not an end.
 
     Args:
         data: Transitions, (t, b).
