@@ -1,0 +1,54 @@
+"""The site: its navigation lists every page, its API page every public name."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+
+
+def exports(package: str) -> list[str]:
+    """Public names that a package's `__init__.py` re-exports or defines."""
+    tree = ast.parse((ROOT / package / "__init__.py").read_text())
+    found = []
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom):
+            found += [a.asname for a in node.names if a.asname == a.name]
+        elif isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            found.append(node.name)
+        elif isinstance(node, ast.AnnAssign):
+            found.append(ast.unparse(node.target))
+    return [name for name in found if name and not name.startswith("_")]
+
+
+def leaves(nav: list | dict | str) -> list[str]:
+    """The files of a navigation tree."""
+    if isinstance(nav, str):
+        return [nav]
+    children = nav.values() if isinstance(nav, dict) else nav
+    return [file for child in children for file in leaves(child)]
+
+
+@pytest.mark.parametrize("package", ["rmp_mjx", "envs"])
+def test_the_api_page_documents_every_public_name(package):
+    documented = re.findall(r"^::: (\S+)", (DOCS / "api.md").read_text(), re.M)
+    names = exports(package)
+    assert len(names) > 3
+    missing = [name for name in names if f"{package}.{name}" not in documented]
+    assert not missing
+
+
+def test_the_controllers_come_first_on_the_api_page():
+    documented = re.findall(r"^::: (\S+)", (DOCS / "api.md").read_text(), re.M)
+    assert documented[:2] == ["rmp_mjx.RMPVICES", "rmp_mjx.VICES"]
+
+
+def test_the_navigation_lists_every_page_once():
+    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
+    listed = leaves(config["nav"])
+    pages = {p.relative_to(DOCS).as_posix() for p in DOCS.rglob("*.md")}
+    assert sorted(listed) == sorted(pages)
