@@ -15,11 +15,11 @@ from typing import Any
 
 from rich.console import Console
 
+from rmp_mjx.files import write_text
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
     config_of,
-    write_text,
 )
 from rmp_mjx.training.runs import distributed, run_folder
 

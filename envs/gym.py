@@ -20,10 +20,11 @@ from gymnasium.vector import (  # pyright: ignore[reportMissingImports]
     VectorEnv,
 )
 from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
-from jaxtyping import Array, Bool, Int, Key
+from jaxtyping import Array, Int, Key
 
 from envs.base import ArmEnv
 from envs.types import State
+from rmp_mjx.trees import cast_like, select
 
 LARGEST_SEED = 2**31
 """Seeds of starts are drawn below this."""
@@ -45,12 +46,7 @@ def _draw(random: np.random.Generator) -> int:
 
 def _strong(tree: Any) -> Any:
     """Leaves with types of their own: otherwise a step is compiled twice."""
-
-    def convert(x):
-        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        return x if is_key else jax.lax.convert_element_type(x, x.dtype)
-
-    return jax.tree.map(convert, tree)
+    return cast_like(tree, tree)
 
 
 class TaskEnv(gymnasium.Env):
@@ -152,7 +148,7 @@ class TaskVector(VectorEnv):
 
             def reset(state, keys):
                 new, later = fresh(keys)
-                return _select(done, (new, later), (state, keys))
+                return select(done, (new, later), (state, keys))
 
             following, keys = jax.lax.cond(
                 done.any(), reset, lambda *same: same, _strong(state), lanes.keys
@@ -222,12 +218,3 @@ def _masked(metrics: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
     """Metrics as Gymnasium's vectors hand on info: values, and whose they are."""
     values = {name: np.where(mask, x, 0.0) for name, x in metrics.items()}
     return values | {f"_{name}": mask for name in metrics}
-
-
-def _select(mask: Bool[Array, " b"], new: Any, old: Any) -> Any:
-    """Take `new` where the mask holds, leaf by leaf."""
-
-    def pick(n, o):
-        return jnp.where(mask.reshape(mask.shape + (1,) * (o.ndim - 1)), n, o)
-
-    return jax.tree.map(pick, new, old)

@@ -13,13 +13,15 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Room -> the rooms that it may import (besides itself). Single modules at the top of
 # the package are rooms of their own; `rmp_mjx` is the public facade.
-GROUND = {"math", "names", "pytree", "xla"}
+GROUND = {"math", "names", "pytree", "trees", "xla"}
 BASE = GROUND | {"types", "vec"}
 LAW = {
     "math": set(),
     "names": set(),
     "pytree": set(),
+    "trees": set(),
     "xla": set(),
+    "files": set(),
     "runtime": set(),
     "types": GROUND,
     "vec": GROUND,
@@ -29,7 +31,7 @@ LAW = {
     "robot": BASE | {"rmp", "obstacles"},
     "control": BASE | {"rmp", "shapes", "obstacles", "robot"},
     "sim": BASE | {"obstacles", "robot", "runtime"},
-    "training": GROUND | {"types", "runtime"},
+    "training": GROUND | {"types", "runtime", "files"},
     "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
 }
 TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}

@@ -12,7 +12,7 @@ from benchmarks.paper.cells import PAPER, TASKS, VARIANTS, Preset
 from benchmarks.paper.columns import COLUMNS, PICTURED, TABLE
 from benchmarks.paper.page import Block, Code, Heading, Picture, Text
 from benchmarks.paper.store import Store
-from rmp_mjx.training.config import write_text
+from rmp_mjx.files import write_text
 
 FIGURES = "figures"
 TITLE = "The paper's experiments, measured"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import polars as pl
 
 from benchmarks.paper.cells import Cell
+from rmp_mjx.files import replacing
 
 KEY = "rmp_mjx"
 """Key of the provenance in a parquet file's metadata."""
@@ -59,11 +59,10 @@ class Store:
         keys = [pl.lit(value).alias(name) for name, value in place.items()]
         path = self.path(kind, cell, column)
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".tmp")
-        rows.select(*keys, pl.exclude(list(place))).write_parquet(
-            temporary, metadata={KEY: json.dumps(about)}
-        )
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            rows.select(*keys, pl.exclude(list(place))).write_parquet(
+                temporary, metadata={KEY: json.dumps(about)}
+            )
 
     def about(
         self, kind: str, cell: Cell, column: str | None = None

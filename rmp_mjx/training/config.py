@@ -3,10 +3,11 @@
 import dataclasses
 import difflib
 import json
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+from rmp_mjx.files import write_text
 
 CONTROLLERS = ("rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf")
 PHYSICS = ("auto", "mujoco", "mjx", "warp")
@@ -243,13 +244,6 @@ def differing_fields(old: TrainConfig, new: TrainConfig) -> dict[str, tuple]:
         if field.name not in RESUMABLE
         and getattr(old, field.name) != getattr(new, field.name)
     }
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replace a file in one move: a killed process leaves the old or the new."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
 
 
 def save_config(config: TrainConfig, path: Path) -> None:

@@ -16,13 +16,14 @@ from rmp_mjx.training.evaluation.recording import Recording
 from rmp_mjx.training.learning import devices, episodes
 from rmp_mjx.training.learning.episodes import EpisodeFold
 from rmp_mjx.training.learning.networks import Agent
-from rmp_mjx.training.learning.rollout import Env, cast_like, finite_step, select
+from rmp_mjx.training.learning.rollout import Env, finite_step
 from rmp_mjx.training.stats import (
     bootstrap_mean,
     clopper_pearson,
     interquartile_mean,
     mean_sd,
 )
+from rmp_mjx.trees import cast_like, is_key, select
 
 LANES = 128
 """Episodes that run side by side, at most."""
@@ -176,7 +177,7 @@ def play(
 
 def _zeros(shape: jax.ShapeDtypeStruct) -> Array:
     """Zeros of a shape; keys where it is one of keys."""
-    if jnp.issubdtype(shape.dtype, jax.dtypes.prng_key):
+    if is_key(shape):
         return jnp.broadcast_to(jax.random.key(0), shape.shape)
     return jnp.zeros(shape.shape, shape.dtype)
 

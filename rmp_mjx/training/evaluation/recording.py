@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from rmp_mjx.trees import numbers
+
 MAX_STEPS = 400
 """Policy steps of an episode that are kept."""
 
@@ -38,7 +40,7 @@ def blank(state: Any, count: int, steps: int) -> Any:
     def empty(x: Array) -> Array:
         return jnp.zeros((steps + 1, count, *x.shape[1:]), x.dtype)
 
-    return jax.tree.map(empty, _arrays(state))
+    return jax.tree.map(empty, numbers(state))
 
 
 def store(
@@ -62,14 +64,4 @@ def store(
         beyond = jnp.where(wanted, step, row.shape[0])
         return row.at[beyond, episode].set(x, mode="drop")
 
-    return jax.tree.map(write, tape, _arrays(state))
-
-
-def _arrays(state: Any) -> Any:
-    """The states with random keys as plain numbers."""
-
-    def plain(x: Array) -> Array:
-        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        return jax.random.key_data(x) if is_key else x
-
-    return jax.tree.map(plain, state)
+    return jax.tree.map(write, tape, numbers(state))

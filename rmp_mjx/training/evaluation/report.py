@@ -9,6 +9,7 @@ import polars as pl
 from rich.markup import escape
 from rich.table import Table
 
+from rmp_mjx.files import write_text
 from rmp_mjx.training.evaluation import figures
 from rmp_mjx.training.evaluation.evaluate import Episodes, over_seeds, summarise
 from rmp_mjx.training.runs import run_folder
@@ -122,7 +123,7 @@ def save(
     own, *others = columns.values()
     values = {**own, **about} | ({"reference": others[0]} if others else {})
     path = folder / run_folder.EVALUATION
-    path.write_text(json.dumps(values, indent=2) + "\n")
+    write_text(path, json.dumps(values, indent=2) + "\n")
     rows = [
         pl.DataFrame(dict(values)).with_columns(engine=pl.lit(name))
         for name, values in results.items()
@@ -157,5 +158,5 @@ def save_over_seeds(
     }
     own, *_ = columns.values()
     path = folder / run_folder.EVALUATION
-    path.write_text(json.dumps({**own, **about}, indent=2) + "\n")
+    write_text(path, json.dumps({**own, **about}, indent=2) + "\n")
     return columns

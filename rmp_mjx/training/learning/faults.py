@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rmp_mjx.pytree import Pytree
-from rmp_mjx.training.runs.checkpoint import named_leaves
+from rmp_mjx.trees import like, named_leaves, numbers
 
 ACTION, ABOUT = "action", "about"
 """Entries of a file besides the leaves of the state."""
@@ -56,8 +56,8 @@ def dump(
     files = []
     for lane in lanes.tolist():
         one = jax.tree.map(lambda x, lane=lane: x[lane], fault)
-        leaves = named_leaves(one.env_state).items()
-        arrays: dict[str, Any] = {path: _numbers(leaf) for path, leaf in leaves}
+        leaves = named_leaves(numbers(one.env_state)).items()
+        arrays: dict[str, Any] = {path: np.asarray(leaf) for path, leaf in leaves}
         arrays[ACTION] = np.asarray(one.action)
         arrays[ABOUT] = np.array(json.dumps({**about, "lane": lane}))
         folder.mkdir(parents=True, exist_ok=True)
@@ -80,11 +80,12 @@ def load(path: Path, template: Any) -> tuple[Any, Float[np.ndarray, " m"]]:
         ValueError: The file is of another task.
     """
     with np.load(path) as stored:
-        missing = named_leaves(template).keys() - set(stored.files)
+        wanted = named_leaves(template)
+        missing = wanted.keys() - set(stored.files)
         if missing:
             raise ValueError(f"{path} is of another task: no {', '.join(missing)}")
         leaves = [
-            _array(stored[name], leaf) for name, leaf in named_leaves(template).items()
+            like(jnp.asarray(stored[name]), leaf) for name, leaf in wanted.items()
         ]
         action = stored[ACTION]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), action
@@ -101,16 +102,3 @@ def about(path: Path) -> dict[str, Any]:
             return json.loads(str(stored[ABOUT]))
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(f"{path} is no dump of a non-finite step: {error}") from error
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _numbers(leaf: Any) -> np.ndarray:
-    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-
-
-def _array(stored: np.ndarray, like: Any) -> Array:
-    value = jnp.asarray(stored)
-    return jax.random.wrap_key_data(value) if _is_key(like) else value

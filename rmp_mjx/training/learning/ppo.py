@@ -30,6 +30,7 @@ from rmp_mjx.training.learning import devices, rollout, value_scale
 from rmp_mjx.training.learning.advantages import generalised_advantages
 from rmp_mjx.training.learning.loss import Batch, ppo_loss, weighted_mean
 from rmp_mjx.training.learning.networks import make_networks
+from rmp_mjx.trees import cast_like
 
 MIN_OBS_STD = 1e-3
 """Floor on the deviation of an observation that hardly varies."""
@@ -143,7 +144,7 @@ def make_ppo(env: rollout.Env, config: TrainConfig, mesh: Mesh | None = None) ->
             key=key,
             iteration=jnp.int32(0),
         )
-        return rollout.cast_like(state, state)
+        return cast_like(state, state)
 
     def minibatch_step(normalizer, carry, batch):
         learner, may_update, policy_may = carry

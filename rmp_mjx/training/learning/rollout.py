@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.learning import episodes, faults
+from rmp_mjx.trees import cast_like, select
 
 VALUE_LIMIT = 1e6
 """Observations or rewards beyond this magnitude count as non-finite."""
@@ -111,26 +112,6 @@ Act = Callable[
     [Float[Array, "b n"], Key[Array, " b"]],
     tuple[Float[Array, "b m"], dict[str, Array]],
 ]
-
-
-def select(mask: Bool[Array, " b"], new: Any, old: Any) -> Any:
-    """Take `new` where the mask holds, `old` elsewhere, leaf by leaf."""
-
-    def pick(n, o):
-        return jnp.where(mask.reshape(mask.shape + (1,) * (o.ndim - 1)), n, o)
-
-    return jax.tree.map(pick, new, old)
-
-
-def cast_like(tree: Any, reference: Any) -> Any:
-    """Give every leaf the dtype of its reference, strongly typed: no retracing."""
-
-    def cast(x, ref):
-        if jnp.issubdtype(ref.dtype, jax.dtypes.prng_key):
-            return x
-        return jax.lax.convert_element_type(x, ref.dtype)
-
-    return jax.tree.map(cast, tree, reference)
 
 
 def finite_step(

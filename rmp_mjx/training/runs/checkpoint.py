@@ -21,6 +21,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as retention
 
+from rmp_mjx.trees import like, named_leaves, numbers
+
 NEWEST, BEST = "newest", "best"
 """Checkpoints that can be asked for without a number."""
 MERITS = ("success", "return")
@@ -39,19 +41,6 @@ class SaveError(CheckpointError):
     """A checkpoint could not be written; those before it are untouched."""
 
 
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _storable(leaf: Any) -> np.ndarray:
-    data = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-    return np.asarray(jax.device_get(data))
-
-
-def _storable_shape(leaf: Any) -> jax.ShapeDtypeStruct:
-    return jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-
-
 def _describe(path: str, array: np.ndarray) -> dict[str, Any]:
     return {
         "path": path,
@@ -63,12 +52,6 @@ def _describe(path: str, array: np.ndarray) -> dict[str, Any]:
 
 def _digest(arrays: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(arrays, sort_keys=True).encode()).hexdigest()
-
-
-def named_leaves(tree: Any) -> dict[str, Any]:
-    """Leaves of a tree by their paths in it."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
 
 
 def _rank(merit: Mapping[str, float]) -> tuple[float, ...]:
@@ -147,7 +130,7 @@ class Checkpointer:
         """
         arrays, manifest = {}, {}
         for index, (path, leaf) in enumerate(named_leaves(state).items()):
-            array = _storable(leaf)
+            array = np.asarray(jax.device_get(numbers(leaf)))
             if array.size:
                 name = f"{index:05d}"
                 arrays[name] = array
@@ -277,7 +260,7 @@ def _fill(template: Any, stored: dict[str, np.ndarray]) -> Any:
     """Put stored arrays into the template's structure."""
     wrong, leaves = [], []
     for path, leaf in named_leaves(template).items():
-        shape = _storable_shape(leaf)
+        shape = jax.eval_shape(numbers, leaf)
         array = stored.get(path)
         if not np.prod(shape.shape):
             array = np.zeros(shape.shape, shape.dtype)
@@ -290,10 +273,7 @@ def _fill(template: Any, stored: dict[str, np.ndarray]) -> Any:
                 f"{shape.dtype}{list(shape.shape)} wanted"
             )
             continue
-        value = jnp.array(array)
-        if _is_key(leaf):
-            value = jax.random.wrap_key_data(value)
-        leaves.append(value)
+        leaves.append(like(jnp.array(array), leaf))
     if wrong:
         shown = "; ".join(wrong[:5]) + (" ..." if len(wrong) > 5 else "")
         raise CheckpointMismatch(f"checkpoint of another configuration: {shown}")

@@ -16,6 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from rmp_mjx.files import replacing
 from rmp_mjx.training.runs.metrics import Row, of_all_seeds
 from rmp_mjx.training.runs.trackers import Tracker
 
@@ -180,12 +181,11 @@ class RunLogger:
         self._written = time.monotonic()
         if not self._rows:
             return
-        temporary = self._path.with_suffix(".tmp")
         try:
-            pl.DataFrame(self._rows, infer_schema_length=None).write_parquet(temporary)
-            os.replace(temporary, self._path)
+            with replacing(self._path) as temporary:
+                rows = pl.DataFrame(self._rows, infer_schema_length=None)
+                rows.write_parquet(temporary)
         except (OSError, pl.exceptions.PolarsError) as error:
-            temporary.unlink(missing_ok=True)
             self._warn(f"{self._path} cannot be written for now", error)
 
 

@@ -14,6 +14,7 @@ from typing import IO
 
 import jax
 
+from rmp_mjx.files import write_text
 from rmp_mjx.training.runs import trackers
 from rmp_mjx.training.config import (
     ConfigError,
@@ -21,7 +22,6 @@ from rmp_mjx.training.config import (
     differing_fields,
     load_config,
     save_config,
-    write_text,
 )
 
 CONFIG = "config.json"

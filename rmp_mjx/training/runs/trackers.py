@@ -12,6 +12,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
 
+from rmp_mjx.files import write_text
 from rmp_mjx.training.config import ConfigError, TrainConfig
 
 OPTIONAL = ("wandb", "mlflow")
@@ -157,5 +158,5 @@ class MLflow:
 def _remembered(path: Path, make: Callable[[], str]) -> str:
     """The name in a file, made where there is none yet."""
     if not path.exists():
-        path.write_text(make())
+        write_text(path, make())
     return path.read_text()
