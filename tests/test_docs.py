@@ -1,11 +1,14 @@
 """The site: its navigation lists every page, its API page every public name."""
 
 import ast
+import inspect
 import re
 from pathlib import Path
 
 import pytest
 import yaml
+
+from rmp_mjx.rmp.leaves import Barrier
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -52,3 +55,10 @@ def test_the_navigation_lists_every_page_once():
     listed = leaves(config["nav"])
     pages = {p.relative_to(DOCS).as_posix() for p in DOCS.rglob("*.md")}
     assert sorted(listed) == sorted(pages)
+
+
+def test_the_maths_page_and_the_barriers_docstring_have_one_formula():
+    """tests/rmp checks the code against the docstring."""
+    blocks = re.findall(r"^\$\$\n.*?^\$\$", inspect.getdoc(Barrier) or "", re.M | re.S)
+    assert len(blocks) == 1
+    assert blocks[0] in (DOCS / "maths.md").read_text()

@@ -9,28 +9,25 @@ from rmp_mjx.rmp.leaf import ScalarLeaf
 
 
 class Barrier(ScalarLeaf):
-    r"""Velocity-gated barrier on a signed distance ``d`` with speed ``xd = dd/dt``.
-
-    With $x = \max(d - \text{margin}, x_\min)$, the approach
-    $v = \min(\dot x, 0)$ and $h = \exp(-\max(\dot x, 0) / v_\text{out})$,
-    for $x < r$:
+    r"""Velocity-gated barrier on a signed distance ``d`` with rate ``xd = dd/dt``.
 
     $$
     \begin{split}
+    x &= \max(d - \text{margin}, x_\min), \quad
+    v = \min(\dot d, 0), \quad
+    h = e^{-\max(\dot d, 0) / v_{out}} \\
     m &= h \min\bigl(\mu (1 - x/r)^2 (v^2 + \epsilon) / x^4,\ \text{cap}\bigr) \\
     a &= -\eta v + v^2 / x + k_{out} \max(\text{margin} - d, 0) \\
     f &= m a
     \end{split}
     $$
 
-    and exactly zero otherwise. The $v^2 / x$ term is the geodesic curvature of
-    the metric $v^2 / x^4$; ``eps`` keeps a slowly creeping approach heavy.
-
-    A body that leaves is let go over the speed ``v_out``. To let go at once, at
-    $\dot x = 0$, makes a ratchet: when a body that is pushed against the barrier
-    drifts off it, the metric is gone for one control step, the push throws the body
-    inwards, and each time it stops a little closer. Explicit integration of the damping
-    needs ``eta * dt < 2``.
+    for $x < r$, and zero beyond. $v^2 / x$ is the geodesic curvature of the metric
+    $v^2 / x^4$. ``eps`` keeps the metric up in a slow approach. ``k_out`` resists a
+    constant push. The metric fades over the speed ``v_out`` while the body leaves; if
+    it ended at zero speed, a body pushed against the barrier would come closer at
+    every rebound. Explicit integration needs ``eta * dt < 2``. docs/maths.md derives
+    each term.
 
     Source: the collision leaf of Shaw et al., "RMPs for Safe Impedance Control in
     Contact-Rich Manipulation" (2021), signs corrected, with the GDS curvature of
