@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, Self, dataclass_transform
 
 import jax
@@ -43,7 +44,7 @@ class Pytree:
             children, rest = flatten(tree)
             return tuple(zip(keys, children, strict=True)), rest
 
-        def unflatten(rest: tuple, children: tuple) -> Any:
+        def unflatten(rest: Iterable, children: Iterable) -> Any:
             tree = object.__new__(cls)
             tree.__dict__.update(zip(data, children, strict=True))
             tree.__dict__.update(zip(static, rest, strict=True))
