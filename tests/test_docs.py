@@ -62,3 +62,13 @@ def test_the_maths_page_and_the_barriers_docstring_have_one_formula():
     blocks = re.findall(r"^\$\$\n.*?^\$\$", inspect.getdoc(Barrier) or "", re.M | re.S)
     assert len(blocks) == 1
     assert blocks[0] in (DOCS / "maths.md").read_text()
+
+
+def test_the_pages_name_tests_that_exist():
+    """A page may name a test file by its name alone or by its path."""
+    tests = {p.relative_to(ROOT).as_posix() for p in ROOT.glob("tests/**/test_*.py")}
+    names = {path.rpartition("/")[2] for path in tests}
+    text = "".join(page.read_text() for page in DOCS.glob("*.md"))
+    named = set(re.findall(r"(?:[\w/]+/)?test_\w+\.py", text))
+    assert len(named) > 10
+    assert not [n for n in named if n not in names and n not in tests]
