@@ -26,8 +26,7 @@ from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import (
     SiteState,
     arm_state,
-    base_point,
-    forward_kinematics,
+    point_positions,
     site_state,
 )
 from rmp_mjx.shapes import Gap
@@ -301,7 +300,7 @@ class ArmEnv(abc.ABC):
 
     def gaps(self, data: PhysicsState, spheres: Spheres) -> Iterable[Gap]:
         """Distances of all control points to what the tree avoids, kind by kind."""
-        x = Vec.of(self._arm_points(data.qpos[: self.robot.n]), 1)
+        x = Vec.of(point_positions(self.robot, data.qpos[: self.robot.n]), 1)
         rest = x.map(jnp.zeros_like)
         points = self.robot.points
         rho = jnp.asarray(points.radius, data.qpos.dtype)
@@ -315,14 +314,6 @@ class ArmEnv(abc.ABC):
         )
         return functools.reduce(jnp.minimum, nearest)
 
-    def _arm_points(self, q: Float[Array, " n"]) -> Float[Array, "p 3"]:
-        """Control points of the arm in the world frame [m]."""
-        p, R = forward_kinematics(self.robot, q)
-        segment = np.array(self.robot.points.segment)
-        offset = jnp.asarray(self.robot.points.offset, p.dtype)
-        arm = p[:, segment].T + jnp.einsum("ijk,kj->ki", R[:, :, segment], offset)
-        return base_point(self.robot) + arm
-
     def _place(
         self, rng: Array, q: Array, task: dict[str, Array]
     ) -> tuple[Array, Array]:
@@ -334,7 +325,7 @@ class ArmEnv(abc.ABC):
             self.options.layout,
             *self.sphere_box,
             self.keep_clear(task),
-            self._arm_points(q),
+            point_positions(self.robot, q),
             jnp.asarray(self.robot.points.radius),
         )
         return jnp.where(placed[:, None], centers, jnp.array(AWAY)), placed

@@ -88,10 +88,8 @@ def build_scene(
     spec = mujoco.MjSpec.from_file(str(ASSETS / "arena.xml"))
     spec.option.timestep = sim_dt
     spec.option.cone = int(cone == "elliptic")
-    arm = mujoco.MjSpec.from_string(robot.mjcf)
+    arm = robot.mj_spec
     arm.option.timestep = sim_dt  # else attaching warns of a conflict
-    for key in list(arm.keys):
-        arm.delete(key)
     spec.attach(arm, prefix=ARM, frame=spec.worldbody.add_frame())
     contacts = objects(spec)
     balls = [_add_sphere(spec, i, sphere_radius) for i in range(spheres)]

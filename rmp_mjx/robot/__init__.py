@@ -1,4 +1,5 @@
 """The arm: model, kinematics, dynamics and control points."""
 
-from rmp_mjx.robot.mjcf import RobotError as RobotError
+from rmp_mjx.robot.errors import RobotError as RobotError
+from rmp_mjx.robot.errors import RobotWarning as RobotWarning
 from rmp_mjx.robot.model import Robot as Robot

@@ -24,11 +24,13 @@ def dynamics(
     """Inertia and bias at one state: ``tau = Mq qdd + bias``.
 
     The inertia is the pullback of every link's spatial inertia, the bias that of the
-    wrench it takes to move the links at qdd = 0: recursive Newton-Euler.
+    wrench it takes to move the links at qdd = 0: recursive Newton-Euler. The bias also
+    holds up the joints' springs and dampers, where the robot has any.
 
     Returns:
         Mq (n, n) [kg m^2], rotor inertias included, and bias (n,) [N m]: Coriolis,
-        centrifugal and gravity, MuJoCo's ``qfrc_bias``.
+        centrifugal and gravity (MuJoCo's ``qfrc_bias``), minus the forces of dampers
+        and springs (its ``qfrc_passive``).
     """
     n = robot.n
     mass = jnp.asarray(robot.mass, arm.p.dtype)
@@ -68,7 +70,18 @@ def dynamics(
     )
     rotors = jnp.diag(jnp.asarray(robot.armature, arm.p.dtype))
     Mq = materialize(joint_metric(S, momentum) + rotors)
-    return Mq, joint_forces(S, sums[10:])
+    return Mq, _hold_passive(robot, arm, joint_forces(S, sums[10:]))
+
+
+def _hold_passive(robot: Robot, arm: ArmState, bias: Array) -> Array:
+    """The bias plus what balances the joints' dampers and springs."""
+    dtype = arm.p.dtype
+    if robot.damping is not None:
+        bias = bias + jnp.asarray(robot.damping, dtype) * arm.qd
+    if robot.stiffness is not None:
+        stretch = arm.q - jnp.asarray(robot.spring_ref, dtype)
+        bias = bias + jnp.asarray(robot.stiffness, dtype) * stretch
+    return bias
 
 
 def _world_inertia(robot: Robot, arm: ArmState) -> tuple[Vec, Vec, Vec]:

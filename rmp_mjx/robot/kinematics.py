@@ -66,6 +66,10 @@ class Motion(Pytree):
 class ArmState(Pytree):
     """Where every joint frame is and how it moves."""
 
+    q: Float[Array, " n"]
+    """Joint coordinates [rad or m]."""
+    qd: Float[Array, " n"]
+    """Joint velocities [rad/s or m/s]."""
     p: Float[Array, "3 n"]
     """Origins of the joint frames relative to `base_point` [m]."""
     R: Float[Array, "3 3 n"]
@@ -130,7 +134,7 @@ def arm_state(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> Ar
     inner = np.triu(np.ones((robot.n, robot.n)))
     V = Motion.of(_dot((S * qd).stack(), inner))
     A = Motion.of(_dot((V.rate(S) * qd).stack(), inner))
-    return ArmState(p=p, R=R, S=S, V=V, A=A)
+    return ArmState(q=jnp.asarray(q), qd=jnp.asarray(qd), p=p, R=R, S=S, V=V, A=A)
 
 
 def joint_forces(S: Motion, W: Float[Array, "6 n"]) -> Float[Array, " n"]:
@@ -218,20 +222,35 @@ def carry_points(
         Positions relative to the base point, and which joint carries which point,
         one-hot (n, k): `select` with it gives the twist that moves each point.
     """
-    offset = jnp.asarray(offset, arm.p.dtype)
-    carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
-    axes = jnp.concatenate([offset.T[:, None] * carrier, carrier[None]])
-    frames = jnp.concatenate([arm.R, arm.p[:, None]], axis=1)
-    x = _dot(frames.reshape(3, -1), axes.reshape(-1, len(segment)))
-    if (segment < 0).any():
-        fixed = (offset - base_point(robot)) * (segment < 0)[:, None]
-        x = x + fixed.T
-    return Vec.of(x, 0), carrier
+    return _carry(robot, arm.p, arm.R, offset, segment)
+
+
+def point_positions(robot: Robot, q: Float[Array, " n"]) -> Float[Array, "p 3"]:
+    """World positions of the control points (p, 3) [m] at joint coordinates q (n,)."""
+    p, R = forward_kinematics(robot, q)
+    segment = np.array(robot.points.segment, int)
+    x, _ = _carry(robot, p, R, robot.points.offset, segment)
+    return base_point(robot)[None] + x.stack(1)
 
 
 def select(motion: Motion, carrier: np.ndarray) -> Motion:
     """Linear combinations of the columns of motion vectors, by a matrix (n, k)."""
     return Motion.of(_dot(motion.stack(), carrier))
+
+
+def _carry(
+    robot: Robot, p: Array, R: Array, offset: Constant, segment: np.ndarray
+) -> tuple[Vec, np.ndarray]:
+    """`carry_points` from the joint frames."""
+    offset = jnp.asarray(offset, p.dtype)
+    carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
+    axes = jnp.concatenate([offset.T[:, None] * carrier, carrier[None]])
+    frames = jnp.concatenate([R, p[:, None]], axis=1)
+    x = _dot(frames.reshape(3, -1), axes.reshape(-1, len(segment)))
+    if (segment < 0).any():
+        fixed = (offset - base_point(robot)) * (segment < 0)[:, None]
+        x = x + fixed.T
+    return Vec.of(x, 0), carrier
 
 
 def _dot(a: Array, b: Constant) -> Array:

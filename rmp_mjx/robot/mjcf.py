@@ -9,29 +9,21 @@ from pathlib import Path
 import mujoco
 
 from rmp_mjx.names import unknown
+from rmp_mjx.robot.errors import RobotError, warn
+from rmp_mjx.robot.motors import drives
 
 
-class RobotError(ValueError):
-    """The MJCF, or a name given with it, cannot serve as a robot."""
+def read_spec(path: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    """Parse an MJCF file or MJCF text, or copy a spec.
 
-
-def read_spec(path: str | Path) -> mujoco.MjSpec:
-    """Parse an MJCF file, or MJCF text; every body, joint and geom gets a name."""
-    text = str(path)
-    try:
-        if text.lstrip().startswith("<"):
-            spec = mujoco.MjSpec.from_string(text)
-        elif not Path(text).is_file():
-            raise RobotError(f"no MJCF file at '{text}'")
-        else:
-            spec = mujoco.MjSpec.from_file(text)
-            folder = Path(text).resolve().parent  # the arm's text must find its assets
-            spec.compiler.meshdir = str(folder / spec.compiler.meshdir)
-            spec.compiler.texturedir = str(folder / spec.compiler.texturedir)
-    except ValueError as error:
-        if isinstance(error, RobotError):
-            raise
-        raise RobotError(f"MuJoCo cannot read the MJCF: {error}") from error
+    Every body, joint and geom gets a name, and asset folders become absolute, so that
+    the arm's text finds its meshes from anywhere.
+    """
+    if isinstance(path, mujoco.MjSpec):
+        spec = path.copy()
+    else:
+        spec = _parse(str(path))
+    _make_assets_absolute(spec)
     for kind in ("body", "joint", "geom"):
         parts = {"body": spec.bodies, "joint": spec.joints, "geom": spec.geoms}[kind]
         taken = {part.name for part in parts}
@@ -41,17 +33,56 @@ def read_spec(path: str | Path) -> mujoco.MjSpec:
     return spec
 
 
+def _parse(text: str) -> mujoco.MjSpec:
+    try:
+        if text.lstrip().startswith("<"):
+            return mujoco.MjSpec.from_string(text)
+        if not Path(text).is_file():
+            raise RobotError(f"no MJCF file at '{text}'")
+        return mujoco.MjSpec.from_file(text)
+    except ValueError as error:
+        if isinstance(error, RobotError):
+            raise
+        raise RobotError(f"MuJoCo cannot read the MJCF: {error}") from error
+
+
+def _make_assets_absolute(spec: mujoco.MjSpec) -> None:
+    """Absolute folders for the spec's own files, absolute names for attached ones."""
+    own = spec.compiler
+    if spec.modelfiledir:
+        folder = Path(spec.modelfiledir).resolve()
+        own.meshdir = str(folder / own.meshdir)
+        own.texturedir = str(folder / own.texturedir)
+    for asset in (*spec.meshes, *spec.hfields, *spec.textures):
+        texture = isinstance(asset, mujoco.MjsTexture)
+        theirs = asset.compiler.texturedir if texture else asset.compiler.meshdir
+        attached = theirs != (own.texturedir if texture else own.meshdir)
+        file = Path(theirs) / asset.file
+        if attached and asset.file and file.is_absolute() and file.is_file():
+            asset.file = str(file)
+
+
+def model_name(spec: mujoco.MjSpec, path: str | Path | mujoco.MjSpec) -> str:
+    """The model's name; without one the file's, or `arm`."""
+    if spec.modelname != "MuJoCo Model":  # what MuJoCo calls a model without a name
+        return spec.modelname
+    if isinstance(path, mujoco.MjSpec) or str(path).lstrip().startswith("<"):
+        return "arm"
+    return Path(path).stem
+
+
 def lock_other_joints(
     spec: mujoco.MjSpec, site: str, joints: Sequence[str] | None
-) -> tuple[mujoco.MjSpec, list[str]]:
+) -> list[str]:
     """Remove every joint (and its actuators) that is not on the chain to the site.
 
-    Tendons, equalities and sensors go with them: the arm is a chain and its motors.
+    Tendons, equalities, sensors and keyframes go with them: the arm is a chain and its
+    actuators.
+
+    Returns:
+        The names of the chain's joints, base first.
     """
-    sites = {s.name: s for s in spec.sites}
-    if site not in sites:
-        raise RobotError(unknown("site", site, sorted(sites)))
-    chain, body = [], sites[site].parent
+    chain, body = [], spec.site(site).parent
     while body is not None and body.name != "world":
         chain = [*body.joints, *chain]
         body = body.parent
@@ -64,7 +95,10 @@ def lock_other_joints(
             raise RobotError(f"joint '{joint.name}' is {kind}: use hinges and slides")
     names = [joint.name for joint in chain]
     if not names:
-        raise RobotError(f"no joint between the world and site '{site}'")
+        raise RobotError(
+            f"no joint between the world and site '{site}', which is on body "
+            f"'{spec.site(site).parent.name}': choose a site or body that moves"
+        )
     if joints is not None:
         for name in joints:
             if name not in names:
@@ -77,30 +111,39 @@ def lock_other_joints(
                 "give all of them, base first"
             )
     for actuator in list(spec.actuators):
-        on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
-        if not on_joint or actuator.target not in names:
+        if not any(drives(actuator, name) for name in names):
             spec.delete(actuator)
-    for part in (*spec.sensors, *spec.equalities, *spec.tendons):
-        spec.delete(part)  # grippers have them, and they may name a joint that goes
+    # Grippers have these, and they may name a joint that goes.
+    for part in (*spec.sensors, *spec.equalities, *spec.tendons, *spec.keys):
+        spec.delete(part)
     for joint in list(spec.joints):
         if joint.name not in names:
             spec.delete(joint)
-    return spec, names
+    return names
 
 
-def home_configuration(
-    spec: mujoco.MjSpec,
-) -> dict[str, float]:
-    """Each joint's coordinate in keyframe `home`, else at the reference pose."""
+def remove_gravity_compensation(spec: mujoco.MjSpec) -> None:
+    """Let the arm weigh what it weighs: the controllers carry it themselves."""
+    floating = [body for body in spec.bodies if body.gravcomp]
+    for body in floating:
+        body.gravcomp = 0.0
+    if floating:
+        warn(
+            f"bodies {[body.name for body in floating]} have gravcomp, which is left "
+            "out: the controllers carry the arm's weight themselves"
+        )
+
+
+def home_configuration(spec: mujoco.MjSpec) -> dict[str, float] | None:
+    """Each joint's coordinate in keyframe `home`, if the file has it."""
     model = compile_spec(spec)
-    qpos = model.qpos0
     for k in range(model.nkey):
         if model.key(k).name == "home":
-            qpos = model.key_qpos[k]
-    return {
-        model.joint(j).name: float(qpos[model.jnt_qposadr[j]])
-        for j in range(model.njnt)
-    }
+            return {
+                model.joint(j).name: float(model.key_qpos[k, model.jnt_qposadr[j]])
+                for j in range(model.njnt)
+            }
+    return None
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -111,14 +154,28 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
         raise RobotError(f"MuJoCo cannot compile the MJCF: {error}") from error
 
 
-def compile_text(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, str]:
+def compile_text(
+    spec: mujoco.MjSpec,
+) -> tuple[mujoco.MjModel, str, tuple[tuple[str, bytes], ...]]:
     """The arm as MJCF text, and the model compiled from this very text.
 
     MuJoCo writes numbers with six digits: compiled from the text, both are the same
-    arm. Keyframes are left out.
+    arm.
+
+    Returns:
+        The model, its text, and the assets that exist in memory only, by file name.
+
+    Raises:
+        RobotError: MuJoCo cannot compile the arm, or cannot find its files.
     """
-    for key in list(spec.keys):
-        spec.delete(key)
     compile_spec(spec)
     text = spec.to_xml()
-    return mujoco.MjModel.from_xml_string(text), text
+    assets = dict(spec.assets)
+    try:
+        model = mujoco.MjSpec.from_string(text, assets=assets).compile()
+    except ValueError as error:
+        raise RobotError(
+            f"MuJoCo cannot compile the arm's own text: {error}. If a file is missing, "
+            "give each spec an absolute compiler.meshdir before you attach it"
+        ) from error
+    return model, text, tuple(sorted(assets.items()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,13 +21,22 @@ from rmp_mjx.robot.control_points import (
     sample_control_points,
     touching_pairs,
 )
+from rmp_mjx.robot.end_effector import end_effector
+from rmp_mjx.robot.errors import RobotError
+from rmp_mjx.robot.fingerprint import fingerprint
+from rmp_mjx.robot.links import carriers, frame_with_z, lumped_inertias, segments
 from rmp_mjx.robot.mjcf import (
-    RobotError,
+    compile_spec,
     compile_text,
     home_configuration,
     lock_other_joints,
+    model_name,
     read_spec,
+    remove_gravity_compensation,
 )
+from rmp_mjx.robot.motors import make_motors
+from rmp_mjx.robot.passive import PassiveForces, passive_forces
+from rmp_mjx.robot.posture import nominal_posture
 from rmp_mjx.types import Constant
 
 ARMATURE = {
@@ -36,7 +46,7 @@ ARMATURE = {
 """Rotor inertias of the Jaco 2 [kg m^2]: the file's own, or robosuite's 5/(i+1)."""
 
 SPACING = 0.0135
-"""Default distance between control points [m]: about 64 of them on the Jaco 2."""
+"""Default distance between control points [m]: 59 of them on the Jaco 2."""
 
 
 class Robot(Pytree):
@@ -54,7 +64,7 @@ class Robot(Pytree):
     q_ref: Float[Constant, " n"]
     """Joint coordinates of the reference pose (MuJoCo's qpos0) [rad or m]."""
     q_home: Float[Constant, " n"]
-    """Nominal posture: keyframe `home`, else q_ref."""
+    """Nominal posture, within the joint limits."""
     q_lower: Float[Constant, " n"]
     """Lower joint limits; -inf for an unlimited joint."""
     q_upper: Float[Constant, " n"]
@@ -88,7 +98,26 @@ class Robot(Pytree):
     body_names: tuple[str, ...] = struct.field(pytree_node=False)
     """Bodies of the arm that carry capsules."""
     mjcf: str = struct.field(pytree_node=False)
-    """The arm-only model as MJCF text."""
+    """The arm-only model as MJCF text: the chain, and one torque motor per joint."""
+    name: str = struct.field(pytree_node=False, default="arm")
+    """The MJCF model's name."""
+    assets: tuple[tuple[str, bytes], ...] = struct.field(pytree_node=False, default=())
+    """Meshes and textures that exist in memory only: (file name, content)."""
+    damping: Float[Constant, " n"] | None = None
+    """Viscous damping that the controllers compensate; None for none
+    [N m s/rad or N s/m]."""
+    stiffness: Float[Constant, " n"] | None = None
+    """Stiffness of the joint springs that they compensate; None for none
+    [N m/rad or N/m]."""
+    spring_ref: Float[Constant, " n"] | None = None
+    """Joint coordinates at which those springs are slack [rad or m]."""
+
+    def __repr__(self) -> str:
+        """Name, joints, end effector and control points on one line."""
+        return (
+            f"Robot '{self.name}': {self.n} joints to site '{self.site_name}', "
+            f"{len(self.points.segment)} control points"
+        )
 
     @property
     def n(self) -> int:
@@ -98,7 +127,17 @@ class Robot(Pytree):
     @property
     def mj_model(self) -> mujoco.MjModel:
         """The arm-only model, compiled by MuJoCo C (a new copy each time)."""
-        return mujoco.MjModel.from_xml_string(self.mjcf)
+        return self.mj_spec.compile()
+
+    @property
+    def mj_spec(self) -> mujoco.MjSpec:
+        """The arm-only model to edit or to attach to a scene (a new copy each time)."""
+        return mujoco.MjSpec.from_string(self.mjcf, assets=dict(self.assets))
+
+    @property
+    def fingerprint(self) -> str:
+        """32 hex digits that say which arm this is; see `fingerprint.fingerprint`."""
+        return fingerprint(self)
 
     @property
     def control_points(self) -> list[tuple[str, np.ndarray, float]]:
@@ -121,7 +160,9 @@ class Robot(Pytree):
             name: `jaco2`.
             armature: `physical` (geared actuators, the default) or `robosuite`, which
                 adds 5/(i+1) kg m^2 to joint i and so dominates the arm's inertia.
-            **kwargs: Passed to `from_mjcf` (for instance `spacing`).
+            **kwargs: Passed to `from_mjcf` (for instance `spacing`). Unlike there,
+                `compensate_passive` is off: the small damping of the Jaco's joints
+                stands for losses that a controller does not know.
 
         Raises:
             RobotError: Unknown name or armature setting.
@@ -131,41 +172,65 @@ class Robot(Pytree):
         if armature not in ARMATURE:
             raise RobotError(unknown("armature setting", armature, list(ARMATURE)))
         path = resources.files("rmp_mjx.robot") / "jaco2" / "jaco2.xml"
-        options = {"site": "grip", "armature": ARMATURE[armature]} | kwargs
-        return Robot.from_mjcf(str(path), **options)
+        options: dict[str, Any] = {
+            "site": "grip",
+            "armature": ARMATURE[armature],
+            "compensate_passive": False,
+        }
+        return Robot.from_mjcf(str(path), **options | kwargs)
 
     @staticmethod
     def from_mjcf(
-        path: str | Path,
-        site: str,
+        path: str | Path | mujoco.MjSpec,
+        site: str | None = None,
         joints: Sequence[str] | None = None,
         links: Sequence[str] | None = None,
         *,
+        body: str | None = None,
+        offset: Sequence[float] = (0.0, 0.0, 0.0),
         armature: Sequence[float] | None = None,
         torque_limits: Sequence[float] | None = None,
+        q_home: Sequence[float] | None = None,
+        compensate_passive: bool = True,
         spacing: float = SPACING,
     ) -> Robot:
         """Build a robot from any MJCF with a serial chain of hinge or slide joints.
 
-        Joints that are not on the chain from the world to the site (fingers, say) are
-        locked at their reference position.
+        Joints that are not on the chain from the world to the end effector (fingers,
+        say) are locked at their reference position. The chain's actuators, of whatever
+        kind, become torque motors in `mjcf`, `mj_model` and every scene made of them.
 
         Args:
-            path: MJCF file, or MJCF text.
+            path: MJCF file, MJCF text, or a spec, which is copied.
             site: End-effector site; the chain runs from the world to its body.
             joints: The chain's joints, base first; default all of them.
             links: Bodies that carry control points; default all with geoms.
-            armature: Rotor inertias that replace the file's [kg m^2].
-            torque_limits: Actuator limits [N m] where the file gives none.
+            body: Body of the end effector, instead of a site.
+            offset: End effector's position in that body's frame, (3,) [m].
+            armature: Rotor inertias that replace the file's, (n,) [kg m^2].
+            torque_limits: Actuator limits that replace the file's, (n,) [N m or N].
+            q_home: Nominal posture, (n,) [rad or m]; default keyframe `home`, else the
+                reference pose, with joints at mid-range where that is outside or close
+                to the end of their range.
+            compensate_passive: Whether the controllers make up for the file's joint
+                damping and springs.
             spacing: Distance between control points along a link's capsules [m].
 
         Raises:
             RobotError: A name is unknown, the chain has a joint that is neither hinge
-                nor slide, or the actuators are not one limited motor per joint.
+                nor slide, a joint has not exactly one actuator with a torque limit, or
+                the posture is outside the joint ranges.
+
+        Warns:
+            RobotWarning: The file has dry friction or something else that the
+                controllers cannot compensate, or the posture had to be chosen.
         """
         spec = read_spec(path)
+        site = end_effector(spec, site, body, offset)
         home = home_configuration(spec)
-        spec, joints = lock_other_joints(spec, site, joints)
+        joints = lock_other_joints(spec, site, joints)
+        remove_gravity_compensation(spec)
+        make_motors(spec, compile_spec(spec), joints, torque_limits)
         if armature is not None:
             if len(armature) != len(joints):
                 raise RobotError(
@@ -173,20 +238,25 @@ class Robot(Pytree):
                 )
             for name, value in zip(joints, armature, strict=True):
                 spec.joint(name).armature = value
-        model, mjcf = compile_text(spec)
+        model, mjcf, assets = compile_text(spec)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         ids = [model.joint(name).id for name in joints]
         frames_p = np.array([data.xanchor[j] for j in ids])
-        frames_R = np.array([_frame_with_z(data.xaxis[j]) for j in ids])
-        segment = _segments(model, ids)
-        mass, com, inertia = _lumped_inertias(model, data, segment, frames_p, frames_R)
-        carriers = _carriers(model, segment, links)
+        frames_R = np.array([frame_with_z(data.xaxis[j]) for j in ids])
+        segment = segments(model, ids)
+        mass, com, inertia = lumped_inertias(model, data, segment, frames_p, frames_R)
         capsules, bodies = body_capsules(
-            model, data, segment, frames_p, frames_R, carriers
+            model, data, segment, frames_p, frames_R, carriers(model, segment, links)
         )
         limited = model.jnt_limited[ids].astype(bool)
+        lower = np.where(limited, model.jnt_range[ids, 0], -np.inf)
+        upper = np.where(limited, model.jnt_range[ids, 1], np.inf)
+        q_ref = model.qpos0[model.jnt_qposadr[ids]].copy()
+        passive = passive_forces(model, joints)
+        if not compensate_passive:
+            passive = PassiveForces()
         site_id = model.site(site).id
         R_last = frames_R[-1]
         prev_p = np.vstack([np.zeros(3), frames_p[:-1]])
@@ -194,11 +264,11 @@ class Robot(Pytree):
         return Robot(
             offset=np.einsum("nji,nj->ni", prev_R, frames_p - prev_p),
             rotation=np.einsum("nji,njk->nik", prev_R, frames_R),
-            q_ref=model.qpos0[model.jnt_qposadr[ids]].copy(),
-            q_home=np.array([home[name] for name in joints]),
-            q_lower=np.where(limited, model.jnt_range[ids, 0], -np.inf),
-            q_upper=np.where(limited, model.jnt_range[ids, 1], np.inf),
-            tau_max=_torque_limits(model, joints, torque_limits),
+            q_ref=q_ref,
+            q_home=nominal_posture(joints, lower, upper, q_ref, home, q_home),
+            q_lower=lower,
+            q_upper=upper,
+            tau_max=model.actuator_ctrlrange[:, 1].copy(),
             mass=mass,
             com=com,
             inertia=inertia,
@@ -217,108 +287,7 @@ class Robot(Pytree):
             site_name=site,
             body_names=tuple(dict.fromkeys(bodies)),
             mjcf=mjcf,
+            name=model_name(spec, path),
+            assets=assets,
+            **passive._asdict(),
         )
-
-
-def _frame_with_z(z: np.ndarray) -> np.ndarray:
-    """Right-handed rotation whose third column is z."""
-    helper = np.eye(3)[np.argmin(np.abs(z))]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
-
-
-def _segments(model: mujoco.MjModel, ids: Sequence[int]) -> np.ndarray:
-    """Index of the last chain joint at or above each body; -1 for the fixed base."""
-    segment = np.full(model.nbody, -1)
-    for body in range(1, model.nbody):
-        own = [k for k, j in enumerate(ids) if model.jnt_bodyid[j] == body]
-        segment[body] = own[-1] if own else segment[model.body_parentid[body]]
-    return segment
-
-
-def _lumped_inertias(model, data, segment, frames_p, frames_R):
-    """Mass, centre and inertia of the bodies that move with each joint."""
-    n = len(frames_p)
-    mass, com, inertia = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
-    for k in range(n):
-        bodies = np.flatnonzero(segment == k)
-        m = model.body_mass[bodies]
-        mass[k] = m.sum()
-        centre = m @ data.xipos[bodies] / max(mass[k], 1e-12)
-        if mass[k] <= 0:
-            centre = frames_p[k]
-        world = np.zeros((3, 3))
-        for b in bodies:
-            R = data.ximat[b].reshape(3, 3)
-            r = data.xipos[b] - centre
-            world += R @ np.diag(model.body_inertia[b]) @ R.T
-            world += model.body_mass[b] * (r @ r * np.eye(3) - np.outer(r, r))
-        com[k] = frames_R[k].T @ (centre - frames_p[k])
-        inertia[k] = frames_R[k].T @ world @ frames_R[k]
-    return mass, com, inertia
-
-
-def _carriers(
-    model: mujoco.MjModel, segment: np.ndarray, links: Sequence[str] | None
-) -> set[int]:
-    """Bodies whose geoms become capsules."""
-    with_geoms = [b for b in range(1, model.nbody) if model.body_geomnum[b] > 0]
-    names = {model.body(b).name: b for b in with_geoms}
-    if links is None:
-        return set(with_geoms)
-    for link in links:
-        if link not in names:
-            raise RobotError(unknown("link with geoms", link, list(names)))
-    return {names[link] for link in links}
-
-
-def _torque_limits(
-    model: mujoco.MjModel, joints: Sequence[str], given: Sequence[float] | None
-) -> np.ndarray:
-    """Largest torque each joint's single motor can give."""
-    if given is not None:
-        limits = np.asarray(given, float)
-        if limits.shape != (len(joints),) or not np.all(limits > 0):
-            raise RobotError(f"torque_limits must be {len(joints)} positive numbers")
-        return limits
-    limits = []
-    for name in joints:
-        joint = model.joint(name).id
-        motors = [
-            a
-            for a in range(model.nu)
-            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-            and model.actuator_trnid[a, 0] == joint
-        ]
-        if len(motors) != 1:
-            raise RobotError(
-                f"joint '{name}' has {len(motors)} actuators: it needs one motor, "
-                "or pass torque_limits="
-            )
-        limits.append(_motor_limit(model, motors[0], joint))
-    return np.array(limits)
-
-
-def _motor_limit(model: mujoco.MjModel, motor: int, joint: int) -> float:
-    name = model.actuator(motor).name
-    if model.actuator_biastype[motor] != mujoco.mjtBias.mjBIAS_NONE:
-        raise RobotError(
-            f"actuator '{name}' is not a motor (it has a bias): torque control needs "
-            "<motor>, or pass torque_limits="
-        )
-    gear = abs(model.actuator_gear[motor, 0])
-    candidates = []
-    if model.actuator_ctrllimited[motor]:
-        gain = model.actuator_gainprm[motor, 0]
-        candidates.append(gain * gear * np.abs(model.actuator_ctrlrange[motor]).min())
-    if model.actuator_forcelimited[motor]:
-        candidates.append(gear * np.abs(model.actuator_forcerange[motor]).min())
-    if model.jnt_actfrclimited[joint]:
-        candidates.append(np.abs(model.jnt_actfrcrange[joint]).min())
-    if not candidates:
-        raise RobotError(
-            f"actuator '{name}' has no ctrlrange or forcerange: give one, "
-            "or pass torque_limits="
-        )
-    return float(min(candidates))

@@ -21,7 +21,9 @@ def _moved_robot(robot):
     mounted = robot.mjcf.replace(
         '<body name="base"', '<body name="base" pos=".3 -.2 .5" quat=".48 .36 -.48 .64"'
     )
-    moved = Robot.from_mjcf(mounted, site="grip").replace(q_home=robot.q_home)
+    moved = Robot.from_mjcf(
+        mounted, site="grip", q_home=robot.q_home, compensate_passive=False
+    )
     data = mujoco.MjData(moved.mj_model)
     mujoco.mj_kinematics(moved.mj_model, data)
     p, R = data.body("base").xpos, data.body("base").xmat.reshape(3, 3)

@@ -19,7 +19,8 @@ def _arm(actuators=MOTOR, joint='<joint name="shoulder"/>'):
 REFUSALS = {
     "unknown site": (
         lambda: Robot.from_mjcf(_arm(), site="tipp"),
-        "unknown site 'tipp'; valid names: floor, tip. Did you mean 'tip'?",
+        "unknown site 'tipp'; valid names: floor, tip. Did you mean 'tip'? Or name a "
+        "body, body='bare'; bodies: arm, bare",
     ),
     "unknown joint": (
         lambda: Robot.from_mjcf(_arm(), site="tip", joints=["sholder"]),
@@ -46,25 +47,24 @@ REFUSALS = {
     ),
     "fixed site": (
         lambda: Robot.from_mjcf(_arm(), site="floor"),
-        "no joint between the world and site 'floor'",
+        "no joint between the world and site 'floor', which is on body 'world': choose "
+        "a site or body that moves",
     ),
     "no actuator": (
         lambda: Robot.from_mjcf(_arm(""), site="tip"),
-        "joint 'shoulder' has 0 actuators: it needs one motor, or pass torque_limits=",
+        "joint 'shoulder' has 0 actuators: it needs one actuator, or "
+        "pass torque_limits=",
     ),
     "two actuators": (
         lambda: Robot.from_mjcf(_arm(MOTOR + MOTOR.replace("drive", "b")), site="tip"),
         "joint 'shoulder' has 2 actuators",
     ),
-    "position actuator": (
-        lambda: Robot.from_mjcf(_arm(MOTOR.replace("motor", "position")), site="tip"),
-        "actuator 'drive' is not a motor (it has a bias)",
-    ),
     "motor without range": (
         lambda: Robot.from_mjcf(
             _arm('<motor name="drive" joint="shoulder"/>'), site="tip"
         ),
-        "actuator 'drive' has no ctrlrange or forcerange: give one",
+        "actuator 'drive' is a motor without ctrlrange or forcerange, so that its "
+        "torque limit is unknown: give it one, or pass torque_limits=",
     ),
     "armature of the wrong length": (
         lambda: Robot.from_mjcf(_arm(), site="tip", armature=[1.0, 2.0]),

@@ -1,0 +1,176 @@
+"""One torque motor per joint, whatever actuators the file has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from rmp_mjx.robot.errors import RobotError, warn
+
+_ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+def drives(actuator: mujoco.MjsActuator, joint: str) -> bool:
+    """Whether the actuator acts on this joint."""
+    return actuator.trntype in _ON_JOINT and actuator.target == joint
+
+
+def make_motors(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    joints: Sequence[str],
+    given: Sequence[float] | None,
+) -> None:
+    """Replace the chain's actuators by motors, in the order of the joints.
+
+    A motor has a gear of 1, so that its control is the joint's torque [N m], and a
+    control range of plus and minus its limit. The actuators keep their names; their
+    rotor inertia and damping pass to the joints. A file that has just these motors
+    stays as it is.
+
+    Args:
+        spec: The arm; edited.
+        model: The same, compiled.
+        joints: The chain's joints, base first.
+        given: Torque limits that replace the file's, (n,) [N m or N].
+
+    Raises:
+        RobotError: A limit is missing or not positive, or a joint has no actuator or
+            several.
+    """
+    if given is not None and (
+        len(given) != len(joints) or not all(np.isfinite(x) and x > 0 for x in given)
+    ):
+        raise RobotError(
+            f"torque_limits must be {len(joints)} positive numbers, got {list(given)}"
+        )
+    groups = [[a for a in spec.actuators if drives(a, name)] for name in joints]
+    if given is None:
+        limits = [
+            _limit(model, name, group)
+            for name, group in zip(joints, groups, strict=True)
+        ]
+    else:
+        limits = [float(limit) for limit in given]
+        for name in joints:  # else the simulation would still apply the file's
+            if model.jnt_actfrclimited[model.joint(name).id]:
+                spec.joint(name).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    order = [a.id for group in groups for a in group]
+    if order == list(range(len(joints))) and all(
+        len(group) == 1 and _is_motor(model, group[0], limit)
+        for group, limit in zip(groups, limits, strict=True)
+    ):
+        return
+    names = [group[0].name if len(group) == 1 else "" for group in groups]
+    _move_losses_to_joints(spec, model, joints, groups)
+    for group in groups:
+        for actuator in group:
+            spec.delete(actuator)
+    for name, joint, limit in zip(names, joints, limits, strict=True):
+        _add_motor(spec, name, joint, limit)
+
+
+def _add_motor(spec: mujoco.MjSpec, name: str, joint: str, limit: float) -> None:
+    """Every attribute is set: the file's default class must not leak in."""
+    motor = spec.add_actuator(name=name)
+    motor.set_to_motor()
+    motor.trntype, motor.target = mujoco.mjtTrn.mjTRN_JOINT, joint
+    motor.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    motor.ctrlrange = [-limit, limit]
+    motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    motor.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    motor.armature, motor.damping = 0.0, np.zeros(3)
+    motor.nsample, motor.delay = 0, 0.0
+
+
+def _is_motor(
+    model: mujoco.MjModel, actuator: mujoco.MjsActuator, limit: float
+) -> bool:
+    """Whether control is torque, within exactly the limit."""
+    a = actuator.id
+    return (
+        _kind(model, a) == "motor"
+        and model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+        and model.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_gainprm[a, 0] == 1.0
+        and model.actuator_gear[a, 0] == 1.0
+        and bool(model.actuator_ctrllimited[a])
+        and bool(np.all(model.actuator_ctrlrange[a] == [-limit, limit]))
+        and not (actuator.armature or np.any(actuator.damping) or actuator.nsample)
+    )
+
+
+def _kind(model: mujoco.MjModel, a: int) -> str:
+    """What MJCF calls an actuator like this one."""
+    bias, gain = model.actuator_biastype[a], model.actuator_gaintype[a]
+    if gain != mujoco.mjtGain.mjGAIN_FIXED:
+        return "general"
+    if bias == mujoco.mjtBias.mjBIAS_NONE:
+        return "motor"
+    if bias == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[a, 1]:
+        return "position"
+    if bias == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[a, 2]:
+        return "velocity"
+    return "general"
+
+
+def _limit(
+    model: mujoco.MjModel, joint: str, group: Sequence[mujoco.MjsActuator]
+) -> float:
+    """Largest torque, either way, that the joint's one actuator can give."""
+    if len(group) != 1:
+        names = f" ({', '.join(repr(a.name) for a in group)})" if group else ""
+        raise RobotError(
+            f"joint '{joint}' has {len(group)} actuators{names}: it needs one "
+            "actuator, or pass torque_limits="
+        )
+    a, name = group[0].id, group[0].name or f"on joint {joint}"
+    kind, gear = _kind(model, a), model.actuator_gear[a, 0]
+    ranges = []
+    if model.actuator_forcelimited[a]:
+        ranges.append(gear * model.actuator_forcerange[a])
+    joint_id = model.joint(joint).id
+    if model.jnt_actfrclimited[joint_id]:
+        ranges.append(model.jnt_actfrcrange[joint_id])
+    if kind == "motor" and model.actuator_ctrllimited[a]:
+        gain = model.actuator_gainprm[a, 0]
+        ranges.append(gain * gear * model.actuator_ctrlrange[a])
+    if not ranges:
+        motor = kind == "motor"
+        what = "a motor" if motor else f"a {kind} actuator"
+        missing = "ctrlrange or forcerange" if motor else "forcerange"
+        raise RobotError(
+            f"actuator '{name}' is {what} without {missing}, so that its torque limit "
+            "is unknown: give it one, or pass torque_limits="
+        )
+    if kind == "motor" and model.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE:
+        warn(
+            f"motor '{name}' has activation dynamics, which are left out: its torque "
+            "acts at once"
+        )
+    limit = float(min(min(-min(r), max(r)) for r in ranges))
+    if not limit > 0:
+        shown = ", ".join(f"[{min(r):g}, {max(r):g}]" for r in ranges)
+        raise RobotError(
+            f"actuator '{name}' cannot push both ways: its torque range is {shown}"
+        )
+    return limit
+
+
+def _move_losses_to_joints(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    joints: Sequence[str],
+    groups: Sequence[Sequence[mujoco.MjsActuator]],
+) -> None:
+    """Reflect the actuators' rotor inertia and damping to their joints."""
+    for name, group in zip(joints, groups, strict=True):
+        joint = spec.joint(name)
+        for actuator in group:
+            gear = abs(model.actuator_gear[actuator.id, 0])
+            joint.armature = joint.armature + actuator.armature * gear**2
+            reflected = np.asarray(actuator.damping) * gear ** np.array([2, 3, 4])
+            joint.damping = np.asarray(joint.damping) + reflected

@@ -1,0 +1,209 @@
+"""Whatever actuators a file has, the robot's own model has one torque motor a joint."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from rmp_mjx import Robot, RobotError, RobotWarning
+
+ARM = """<mujoco><compiler angle="radian"/><option gravity="0 0 0"/>
+<default><general ctrlrange="-1 1" gear="7" biastype="affine" biasprm="0 -3 -2"/>
+</default><worldbody><body name="one">
+<joint name="a" axis="0 0 1"/><geom name="one" type="capsule" size=".05 .1"/>
+<body name="two" pos="0 0 .3"><joint name="b" axis="0 1 0" {joint}/>
+<geom name="two" type="capsule" size=".04 .1"/><site name="tip" pos="0 0 .1"/></body>
+</body></worldbody><actuator>{actuators}</actuator></mujoco>"""
+"""Two joints; a default class that would spoil every actuator added carelessly."""
+
+FIRST = '<motor name="first" joint="a" ctrlrange="-5 5" gear="1"/>'
+
+
+def arm(second, first=FIRST, joint="", **kwargs):
+    text = ARM.format(actuators=first + second, joint=joint)
+    return Robot.from_mjcf(text, site="tip", **kwargs)
+
+
+def applied(robot, ctrl):
+    """Torques that MuJoCo applies, moving and away from zero."""
+    data = mujoco.MjData(robot.mj_model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = 0.3, 0.7, ctrl
+    mujoco.mj_forward(robot.mj_model, data)
+    return data.qfrc_actuator
+
+
+ACCEPTED = {
+    "motor": ('<motor name="s" joint="b" gear="1" ctrlrange="-4 4"/>', 4.0),
+    "motor with a gear": ('<motor name="s" joint="b" gear="3" ctrlrange="-4 4"/>', 12),
+    "motor that turns back": (
+        '<motor name="s" joint="b" gear="-3" ctrlrange="-4 5"/>',
+        12.0,
+    ),
+    "gain": (
+        '<general name="s" joint="b" gainprm="2" biastype="none" gear="1" '
+        'ctrlrange="-4 4"/>',
+        8.0,
+    ),
+    "motor with a force range": (
+        '<motor name="s" joint="b" gear="2" ctrlrange="-4 4" forcerange="-3 3"/>',
+        6.0,
+    ),
+    "uneven range": ('<motor name="s" joint="b" gear="1" ctrlrange="-4 9"/>', 4.0),
+    "position": (
+        '<position name="s" joint="b" kp="9" kv="2" gear="1" forcerange="-6 6"/>',
+        6.0,
+    ),
+    "velocity": (
+        '<velocity name="s" joint="b" kv="9" gear="2" forcerange="-6 6"/>',
+        12.0,
+    ),
+    "integrated velocity": (
+        '<intvelocity name="s" joint="b" kp="9" gear="1" forcerange="-6 6" '
+        'actrange="-1 1"/>',
+        6.0,
+    ),
+    "in the parent's frame": (
+        '<motor name="s" jointinparent="b" gear="1" ctrlrange="-4 4"/>',
+        4.0,
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "limit"), ACCEPTED.values(), ids=ACCEPTED.keys())
+def test_control_is_torque_up_to_the_limit(text, limit):
+    robot = arm(text)
+    assert robot.tau_max.tolist() == [5.0, limit]
+    model = robot.mj_model
+    assert [model.actuator(k).name for k in range(model.nu)] == ["first", "s"]
+    assert model.na == 0
+    np.testing.assert_array_equal(applied(robot, [1.5, -2.5]), [1.5, -2.5])
+    np.testing.assert_array_equal(applied(robot, [99, -99]), [5.0, -limit])
+
+
+def test_the_joint_may_limit_a_position_actuator():
+    robot = arm(
+        '<position name="s" joint="b" kp="9" gear="1"/>',
+        joint='actuatorfrcrange="-2 2"',
+    )
+    assert robot.tau_max.tolist() == [5.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        "",
+        '<position name="s" joint="b" kp="9" forcerange="-6 6"/>',
+        '<motor name="s" joint="b" gear="3" ctrlrange="-1 1"/>',
+        '<motor name="s" joint="b" ctrlrange="-1 1"/><damper name="d" joint="b" '
+        'kv="1" ctrlrange="0 1"/>',
+    ],
+    ids=["none", "position", "motor", "two"],
+)
+def test_torque_limits_replace_all_that_the_file_says(second):
+    robot = arm(second, joint='actuatorfrcrange="-2 2"', torque_limits=[8.0, 7.0])
+    assert robot.tau_max.tolist() == [8.0, 7.0]
+    np.testing.assert_array_equal(applied(robot, [99, -6.5]), [8.0, -6.5])
+
+
+def test_motors_come_in_the_order_of_the_joints():
+    """A controller's torques are the controls, one by one."""
+    second = '<motor name="s" joint="b" gear="1" ctrlrange="-4 4"/>'
+    robot = arm(FIRST, first=second)
+    assert robot.tau_max.tolist() == [5.0, 4.0]
+    np.testing.assert_array_equal(applied(robot, [1.5, -2.5]), [1.5, -2.5])
+
+
+def test_rotor_inertia_and_damping_of_an_actuator_pass_to_its_joint():
+    text = (
+        '<position name="s" joint="b" kp="9" gear="2" forcerange="-6 6" '
+        'armature=".5" damping=".25"/>'
+    )
+    robot = arm(text, joint='armature=".1" damping="1"')
+    np.testing.assert_allclose(robot.armature, [0.0, 0.1 + 4 * 0.5])
+    np.testing.assert_allclose(robot.damping, [0.0, 1.0 + 4 * 0.25])
+    original = mujoco.MjModel.from_xml_string(
+        ARM.format(actuators=FIRST + text, joint='armature=".1" damping="1"')
+    )
+    inertia = []
+    for model in (original, robot.mj_model):
+        data, Mq = mujoco.MjData(model), np.zeros((2, 2))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, Mq)
+        inertia.append(Mq)
+    np.testing.assert_allclose(*inertia, rtol=1e-5)  # the text has six digits
+
+
+def test_a_motor_with_dynamics_loses_them_with_a_warning():
+    text = (
+        '<general name="s" joint="b" gear="1" biastype="none" dyntype="filter" '
+        'dynprm=".1" ctrlrange="-4 4"/>'
+    )
+    with pytest.warns(RobotWarning, match="motor 's' has activation dynamics"):
+        robot = arm(text)
+    assert robot.mj_model.na == 0
+
+
+REFUSED = {
+    "position without a force range": (
+        '<position name="s" joint="b" kp="9" ctrlrange="-1 1"/>',
+        "actuator 's' is a position actuator without forcerange, so that its "
+        "torque limit is unknown: give it one, or pass torque_limits=",
+    ),
+    "velocity without a force range": (
+        '<velocity name="s" joint="b" kv="9"/>',
+        "actuator 's' is a velocity actuator without forcerange",
+    ),
+    "one way": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="0 4"/>',
+        r"actuator 's' cannot push both ways: its torque range is \[0, 4\]",
+    ),
+    "several": (
+        '<motor name="s" joint="b" ctrlrange="-1 1"/>'
+        '<motor name="t" joint="b" ctrlrange="-1 1"/>',
+        r"joint 'b' has 2 actuators \('s', 't'\): it needs one",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), REFUSED.values(), ids=REFUSED.keys())
+def test_a_refusal_says_which_actuator_and_what_it_needs(text, message):
+    with pytest.raises(RobotError, match=message):
+        arm(text)
+
+
+@pytest.fixture(scope="module")
+def servos(robot):
+    """The Jaco 2 with position actuators, limits only in their force ranges."""
+    text = robot.mjcf
+    for k, limit in enumerate(robot.tau_max, 1):
+        size = "large" if limit > 10 else "small"
+        motor = f'<general name="joint_{k}" class="{size}" joint="joint_{k}"/>'
+        assert motor in text
+        text = text.replace(
+            motor,
+            f'<position name="joint_{k}" joint="joint_{k}" kp="200" kv="20" '
+            f'forcerange="-{limit} {limit}"/>',
+        )
+    # Without the ranges of the classes, which are torques.
+    text = text.replace('<general ctrlrange="-30.5 30.5"/>', "")
+    text = text.replace('<general ctrlrange="-6.8 6.8"/>', "")
+    return Robot.from_mjcf(
+        text, site="grip", q_home=robot.q_home, compensate_passive=False
+    )
+
+
+def test_an_arm_with_position_actuators_is_the_arm_with_motors(robot, servos):
+    """The same to the last bit, but for its text."""
+    assert servos.replace(mjcf=robot.mjcf) == robot
+
+
+def test_a_position_actuated_arm_holds_still_in_a_task(servos):
+    """One second of the zero action; torques taken for positions gave 1.3 rad."""
+    env = envs.load("trajectory", robot=servos, physics="mujoco", start_noise=0.0)
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
+    start = state.data.qpos
+    for _ in range(20):
+        state = step(state, jnp.zeros(env.action_size))
+    np.testing.assert_allclose(state.data.qpos, start, rtol=0.0, atol=1e-3)
