@@ -120,26 +120,26 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
     "transit": (_transit, "collision leaf for moving among obstacles"),
     "holding_orientation": (
         lambda r: rmp.RMPVICES(r, yielding=HOLDING),
-        "orientation does not yield beside obstacles",
+        "orientation keeps its weight near obstacles",
     ),
     "holding_orientation_at_limits": (
         lambda r: rmp.RMPVICES(r, limit_yielding=HOLDING),
-        "orientation does not yield near joint limits",
+        "orientation keeps its weight near joint limits",
     ),
     "no_stirring": (
         lambda r: rmp.RMPVICES(r, stirring=STILL),
-        "the set-point is not stirred beside obstacles",
+        "no set-point dither near obstacles",
     ),
     "soft_wall": (_soft_wall, "a twentieth of the stiffness inside the margins"),
     "letting_go_at_once": (
         _collision(v_out=1e-9),
-        "the metric ends with the approach",
+        "no release speed: the metric ends with the approach",
     ),
     "no_curvature": (_no_curvature, "collision leaves without the geodesic term"),
     "no_floor": (_collision(eps=0.0), "collision leaves without the velocity floor"),
     "no_margin": (_collision(margin=0.0), "collision leaves without a margin"),
     "long_range": (_collision(r=10.0), "collision leaves without a range"),
-    "clipped_torque": (_Clipped, "each torque clipped by itself"),
+    "clipped_torque": (_Clipped, "each torque clipped separately"),
     "no_self_collision": (
         lambda r: rmp.RMPVICES(r, self_collision=Barrier(mu=0.0)),
         "self-collision leaf switched off",

@@ -65,7 +65,7 @@ def table(axis: Axis, results: Results) -> str:
         "progress",
         "torque jump p99 [N m]",
         "joint jerk p99 [10^3 rad/s^3]",
-        "turns near [1/s]",
+        "joint reversals near [1/s]",
         "saturated [%]",
         "via points reached [%] (VICES)",
     ]
