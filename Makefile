@@ -2,7 +2,7 @@
 #   make train    set up if needed, then run the main job (ARGS="--seed 1" adds options)
 #   make test     set up if needed, then run the tests
 #   make paper    set up if needed, then run the paper's experiments (PRESET=smoke)
-# The rest: lint type format bench bench-peers bench-gate docs test-latest clean.
+# The rest: lint type format bench bench-peers bench-gate docs wheel test-latest clean.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -27,7 +27,7 @@ LATEST_STAMP := $(LATEST)/.installed
 PIP := -m pip --disable-pip-version-check install --quiet
 
 .PHONY: help setup train paper test test-slow test-latest lint format type bench \
-  bench-peers bench-gate docs clean
+  bench-peers bench-gate docs wheel clean
 
 help:
 	@sed -n '1,5s/^#  *//p' Makefile
@@ -82,6 +82,16 @@ bench-gate: $(STAMP)
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+
+# Wheel and sdist, each installed into a fresh environment and tried from another folder.
+wheel: $(STAMP)
+	rm -rf dist build/installed
+	$(PY) -m hatchling build
+	$(PY) -m venv build/installed
+	build/installed/bin/python $(PIP) -c requirements.lock dist/*.whl
+	cd build && installed/bin/python -P ../tests/installed.py
+	build/installed/bin/python $(PIP) --force-reinstall --no-deps dist/*.tar.gz
+	cd build && installed/bin/python -P ../tests/installed.py
 
 # Python 3.12 and the newest release of everything.
 test-latest:
