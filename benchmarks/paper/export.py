@@ -22,8 +22,9 @@ from envs import cli
 from rmp_mjx import runtime
 from rmp_mjx.training.config import ConfigError, TrainConfig, load_config, save_config
 from rmp_mjx.training.learning import seeds
-from rmp_mjx.training.learning.ppo import TrainState, make_ppo
+from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.learning.rollout import Env
+from rmp_mjx.training.learning.state import TrainState
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.checkpoint import Checkpointer, CheckpointError
 

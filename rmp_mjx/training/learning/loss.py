@@ -7,6 +7,8 @@ from brax.training.agents.ppo.networks import PPONetworks
 from jaxtyping import Array, Float
 
 from rmp_mjx.pytree import Pytree
+from rmp_mjx.training.learning.networks import distribution
+from rmp_mjx.training.learning.weighted import weighted_mean
 
 
 class Batch(Pytree):
@@ -24,13 +26,6 @@ class Batch(Pytree):
     """Normalised value targets."""
     weight: Float[Array, " b"]
     """0 leaves a transition out."""
-
-
-def weighted_mean(
-    x: Float[Array, "*b"], weight: Float[Array, "*b"]
-) -> Float[Array, ""]:
-    """Mean of the entries with weight 1; 0 if there are none."""
-    return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
 
 
 def ppo_loss(
@@ -57,17 +52,17 @@ def ppo_loss(
         The loss and its parts.
     """
     policy_params, value_params = params
-    distribution = networks.parametric_action_distribution
     logits = networks.policy_network.apply(normalizer, policy_params, batch.obs)
     values = networks.value_network.apply(normalizer, value_params, batch.obs)
 
-    log_ratio = distribution.log_prob(logits, batch.raw_action) - batch.log_prob
+    actions = networks.parametric_action_distribution
+    log_ratio = actions.log_prob(logits, batch.raw_action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clipping_epsilon, 1.0 + clipping_epsilon)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     policy_loss = -weighted_mean(surrogate, batch.weight)
     entropy = weighted_mean(
-        distribution.create_dist(logits).entropy().sum(-1), batch.weight
+        distribution(networks, logits).entropy().sum(-1), batch.weight
     )
     error = weighted_mean((batch.target - values) ** 2, batch.weight)
     value_loss = 0.5 * vf_coefficient * error

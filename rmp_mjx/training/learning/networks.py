@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import linen
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 Agent = Callable[[Float[Array, "b n"], PRNGKeyArray], Float[Array, "b m"]]
 """Observations and a key to actions in [-1, 1], both batched."""
@@ -47,7 +48,7 @@ def make_networks(
     return ppo_networks.make_ppo_networks(
         observation_size,
         action_size,
-        preprocess_observations_fn=preprocess,  # pyright: ignore[reportArgumentType]
+        preprocess_observations_fn=preprocess,
         policy_hidden_layer_sizes=hidden_sizes,
         value_hidden_layer_sizes=hidden_sizes,
         activation=linen.tanh,
@@ -61,6 +62,32 @@ def make_networks(
             "distribution": "uniform",
         },
     )
+
+
+def distribution(networks: ppo_networks.PPONetworks, logits: Float[Array, "*b k"]):
+    """Distribution of the actions before clipping: Brax's normal one.
+
+    Args:
+        networks: The networks.
+        logits: What the policy network says of observations.
+    """
+    made: Any = networks.parametric_action_distribution.create_dist(logits)
+    return made
+
+
+def sample_action(
+    networks: ppo_networks.PPONetworks,
+    normalizer: Any,
+    policy: Any,
+    obs: Float[Array, "b n"],
+    keys: Key[Array, " b"],
+) -> tuple[Float[Array, "b m"], dict[str, Array]]:
+    """Draw actions, clipped to [-1, 1]; with them the raw ones and their densities."""
+    logits = networks.policy_network.apply(normalizer, policy, obs)
+    distribution = networks.parametric_action_distribution
+    raw = jax.vmap(distribution.sample_no_postprocessing)(logits, keys)
+    extras = {"raw_action": raw, "log_prob": distribution.log_prob(logits, raw)}
+    return jnp.clip(raw, -1.0, 1.0), extras
 
 
 def make_agent(

@@ -15,8 +15,9 @@ from jaxtyping import Array, Key
 
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning import devices
-from rmp_mjx.training.learning.ppo import PPO, TrainState, make_ppo
+from rmp_mjx.training.learning.ppo import PPO, make_ppo
 from rmp_mjx.training.learning.rollout import Env
+from rmp_mjx.training.learning.state import TrainState
 from rmp_mjx.training.runs import run_folder
 
 

@@ -16,7 +16,8 @@ from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.metrics import make_rows
 from rmp_mjx.training.learning.networks import Agent, make_agent
-from rmp_mjx.training.learning.ppo import TrainState, make_ppo
+from rmp_mjx.training.learning.ppo import make_ppo
+from rmp_mjx.training.learning.state import TrainState
 from rmp_mjx.training.learning.rollout import Env
 from rmp_mjx.training.runs.saving import Saver
 from rmp_mjx.training.runs.stopping import StopRequest, TrainingFailure

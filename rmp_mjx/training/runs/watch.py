@@ -11,7 +11,7 @@ from rmp_mjx.training.learning import faults, seeds
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.runs.metrics import SEED, Row
-from rmp_mjx.training.learning.ppo import TrainState
+from rmp_mjx.training.learning.state import TrainState
 
 MAX_LOST_FRACTION = 0.5
 """Training stops where more of an iteration's steps than this become non-finite."""
