@@ -24,9 +24,9 @@ from orbax.checkpoint import checkpoint_managers as retention
 from rmp_mjx.trees import like, named_leaves, numbers
 
 NEWEST, BEST = "newest", "best"
-"""Checkpoints that can be asked for without a number."""
+"""Checkpoints that have a name besides their number."""
 MERITS = ("success", "return")
-"""Means over recent episodes that rank checkpoints, the first first."""
+"""Means over recent episodes that rank checkpoints; the first counts most."""
 
 
 class CheckpointError(RuntimeError):
@@ -100,7 +100,7 @@ class Checkpointer:
             enable_async_checkpointing=False,
             create=False,
             read_only=read_only,
-            # each process by itself: Orbax would wait for the others otherwise
+            # each process alone: Orbax would wait for the others otherwise
             multiprocessing_options=ocp.options.MultiprocessingOptions(
                 primary_host=jax.process_index(),
                 active_processes={jax.process_index()},
@@ -122,11 +122,11 @@ class Checkpointer:
         Args:
             step: Its number, larger than all before.
             state: Any pytree of arrays.
-            merit: How good it is, by `MERITS`; None: not known.
+            merit: Values that rank it, by `MERITS`; None: unknown.
 
         Raises:
             SaveError: It could not be written, for instance because the disk is full.
-                What was written of it is removed; earlier ones are untouched.
+                Its temporary files are removed; earlier ones are untouched.
         """
         arrays, manifest = {}, {}
         for index, (path, leaf) in enumerate(named_leaves(state).items()):
@@ -162,8 +162,8 @@ class Checkpointer:
             template: Pytree of arrays or shapes that the result will look like; parts
                 that are None are not read.
             note: Called with one line for each checkpoint that had to be skipped.
-            which: `newest`, `best`, or a number. Only the newest has a stand-in, the
-                one before it, where it is damaged.
+            which: `newest`, `best`, or a number. If the newest is damaged, the one
+                before it is read instead.
 
         Returns:
             Step number and the state.

@@ -1,7 +1,7 @@
-"""Processes that train one run together: how they meet, and what they agree on.
+"""Several processes that train one run together: joining, and shared decisions.
 
 Every process runs the same program on its own part of the environments. Process 0, the
-primary, is the one that speaks and writes.
+primary, prints and writes.
 """
 
 import os
@@ -19,22 +19,22 @@ from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import ConfigError, TrainConfig
 
 TEXT_SIZE = 4096
-"""Bytes of a text that the primary tells the others."""
+"""Bytes of a text that the primary sends to the others."""
 
 
 def join(
     coordinator: str | None, process_id: int | None, num_processes: int | None
 ) -> None:
-    """Meet the other processes, if there are any; before JAX opens its backend.
+    """Join the other processes, if there are any, before JAX opens its backend.
 
     Args:
-        coordinator: HOST:PORT of process 0. None: under Slurm (`srun` with more than
-            one task) what Slurm says, else this process is alone.
+        coordinator: HOST:PORT of process 0. None: taken from Slurm (`srun` with more
+            than one task), else this process is alone.
         process_id: Number of this process.
-        num_processes: Number of all.
+        num_processes: Number of processes.
 
     Raises:
-        ConfigError: The three do not make sense together.
+        ConfigError: The three contradict each other.
     """
     if coordinator is None and not _under_slurm():
         if process_id is not None or num_processes is not None:
@@ -47,7 +47,7 @@ def join(
             raise ConfigError(f"coordinator must be HOST:PORT, is {coordinator!r}")
         if not 0 <= process_id < num_processes:
             raise ConfigError(
-                f"process_id must lie in 0 .. {num_processes - 1}, is {process_id}"
+                f"process_id must be in 0 .. {num_processes - 1}, is {process_id}"
             )
     jax.distributed.initialize(coordinator, num_processes, process_id)
 
@@ -65,19 +65,19 @@ def alone() -> bool:
 
 
 def is_primary() -> bool:
-    """Whether this process is the one that writes."""
+    """Whether this process writes."""
     return alone() or jax.process_index() == 0
 
 
 def largest(value: int) -> int:
-    """The largest of the processes' values; every process must ask."""
+    """The largest of the processes' values; every process must call it."""
     if alone():
         return value
     return int(np.max(multihost_utils.process_allgather(np.int32(value))))
 
 
 def from_primary(text: str) -> str:
-    """The primary's text; every process must ask."""
+    """The primary's text; every process must call it."""
     if alone():
         return text
     sent = text.encode()[:TEXT_SIZE].ljust(TEXT_SIZE, b"\0")
@@ -86,13 +86,13 @@ def from_primary(text: str) -> str:
 
 
 def open_run(config: TrainConfig) -> tuple[Path, AbstractContextManager]:
-    """`run_folder.open_run` by the primary, for all; every process must ask.
+    """`run_folder.open_run` by the primary, for all; every process must call it.
 
     Returns:
-        The folder, and its lock or, on the others, nothing in its place.
+        The folder, and its lock (None on the other processes).
 
     Raises:
-        ConfigError: On every process, where the primary cannot open the folder.
+        ConfigError: On every process, if the primary cannot open the folder.
     """
     if alone():
         return run_folder.open_run(config)
@@ -110,11 +110,11 @@ def open_run(config: TrainConfig) -> tuple[Path, AbstractContextManager]:
 
 
 def collected(tree: Any, mesh: Mesh) -> Any:
-    """The whole of arrays that are spread over processes; every process must ask.
+    """Gather arrays that are spread over processes; every process must call it.
 
     Returns:
-        Arrays on the primary's CPU, None elsewhere; where this process is alone, the
-        tree as it is.
+        Arrays on the primary's CPU, None elsewhere. If this process is alone, the tree
+        itself.
     """
     if alone():
         return tree

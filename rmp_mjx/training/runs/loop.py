@@ -32,14 +32,14 @@ class TrainResult:
     """How a call of `train` ended."""
 
     agent: Agent
-    """The policy, as the configuration's evaluation wants it; stacked, if there are
-    several seeds (`seeds.of_seed`)."""
+    """The policy in the form that evaluation needs; stacked if there are several seeds
+    (`seeds.of_seed`)."""
     iterations: int
     """Finished iterations."""
     exit_code: int
     """0, or 128 plus the signal that stopped it."""
     had_finished: bool
-    """Whether there was nothing left to do."""
+    """Whether the run had finished before."""
 
 
 def train(
@@ -111,8 +111,8 @@ def train(
             if any(row["nonfinite_envs"] for row in rows):
                 fault = distributed.collected(state.rollout.fault, mesh)
             if primary:
-                watch.look(rows, fault)
-            broken = watch.verdict(rows)
+                watch.report(rows, fault)
+            broken = watch.abort_reason(rows)
             stopping = distributed.largest(stop.signal or 0)
             final = bool(last or stopping or broken)
             if final or done % config.checkpoint_interval == 0:
@@ -147,10 +147,10 @@ def _start(
     checkpoints: Checkpointer | None,
     console: Console,
 ) -> tuple[TrainState, int]:
-    """The first state, new or restored, and the iterations behind it."""
+    """The first state, new or restored, and its finished iterations."""
     nothing = config.resume and checkpoints and not checkpoints.steps
     if nothing:
-        console.print(f"{config.resume} has nothing saved yet and begins anew")
+        console.print(f"{config.resume} has no checkpoint yet and begins anew")
     if checkpoints is None or not config.resume or nothing:
         # donation wants distinct buffers
         return programs.place(programs.init(seeds.keys(config))), 0
@@ -180,11 +180,11 @@ def load_agent(
         folder: Run folder.
         deterministic: Act with the mean action.
         note: Called with one line for each damaged checkpoint.
-        seed_index: Which of the agents, where the run trained several seeds.
+        seed_index: Which agent, if the run trained several seeds.
         checkpoint: `newest`, `best`, or a number.
 
     Returns:
-        Iterations behind the policy, and the policy.
+        Iterations that trained the policy, and the policy.
 
     Raises:
         CheckpointError: There is no usable checkpoint.

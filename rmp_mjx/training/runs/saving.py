@@ -1,4 +1,4 @@
-"""When a run saves, and what happens where it cannot."""
+"""When a run saves, and what happens if it cannot."""
 
 import shutil
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from rmp_mjx.training.runs.stopping import TrainingFailure
 class Saver:
     """Writes a run's checkpoints; one that fails is tried again at the next interval.
 
-    A checkpoint's merit is that of the episodes that finished since the one before.
+    A checkpoint is ranked by the episodes that finished since the previous one.
     """
 
     def __init__(
@@ -27,9 +27,9 @@ class Saver:
         """Start from a run's last checkpoint.
 
         Args:
-            checkpoints: Where they go; None: another process writes them.
+            checkpoints: Where to write them; None: another process does.
             folder: The run's folder, for messages.
-            note: Called with one line where a save fails.
+            note: Called with one line if a save fails.
             last: Iteration of the last checkpoint; 0: there is none.
         """
         self.last = last
@@ -41,7 +41,7 @@ class Saver:
         self._sums = dict.fromkeys(MERITS, 0.0)
 
     def count(self, rows: Sequence[Row]) -> None:
-        """Add an iteration's episodes, of all seeds, to the next checkpoint's merit."""
+        """Add an iteration's episodes, of all seeds, to the next checkpoint's rank."""
         for row in rows:
             finished = int(row["episode/finished"] or 0)
             self._episodes += finished
@@ -54,15 +54,15 @@ class Saver:
         return {name: total / self._episodes for name, total in self._sums.items()}
 
     def save(self, iteration: int, state: Any, final: bool) -> None:
-        """Save, or say loudly that it failed.
+        """Save, or report the failure.
 
         Args:
             iteration: Finished iterations.
-            state: All that training goes on with.
-            final: There is no next time.
+            state: Everything that training needs to continue.
+            final: Whether this is the last save.
 
         Raises:
-            TrainingFailure: It failed twice in a row, or in the end.
+            TrainingFailure: It failed twice in a row, or at the last save.
         """
         try:
             if self._checkpoints:
@@ -81,7 +81,7 @@ class Saver:
         self._episodes, self._sums = 0, dict.fromkeys(MERITS, 0.0)
 
     def how_to_continue(self) -> str:
-        """What is saved, and the command that goes on from there."""
+        """What is saved, and the command that continues from there."""
         if not self.last:
             return "nothing is saved yet"
         return (

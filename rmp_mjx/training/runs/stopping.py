@@ -1,4 +1,4 @@
-"""Why training stops early: a signal, or because it cannot go on."""
+"""Why training stops early: a signal or a failure."""
 
 import os
 import signal
@@ -8,14 +8,14 @@ STOPPING = b"stopping after this iteration; a second signal exits at once\n"
 
 
 class TrainingFailure(RuntimeError):
-    """Training cannot go on; the message says why and how to continue."""
+    """Training cannot continue; the message says why, and how to resume."""
 
 
 class StopRequest:
     """Catches SIGINT and SIGTERM while it is active; a context manager.
 
-    The first signal is only noted, so that the caller can finish and save; a second
-    one ends the process at once.
+    The first signal is recorded, so that the caller can finish and save. A second one
+    ends the process at once.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Where else the rows of a run go: TensorBoard, Weights & Biases, MLflow."""
+"""Trackers that also get the rows of a run: TensorBoard, Weights & Biases, MLflow."""
 
 import dataclasses
 import importlib.util
@@ -16,25 +16,25 @@ from rmp_mjx.files import write_text
 from rmp_mjx.training.config import ConfigError, TrainConfig
 
 OPTIONAL = ("wandb", "mlflow")
-"""Trackers that need an extra: options of `TrainConfig`, modules and extras alike."""
+"""Trackers that need an extra. The name is the option, the module and the extra."""
 
 Values = Mapping[str, float]
 
 
 class Tracker(Protocol):
-    """Takes numbers as training goes on."""
+    """Takes numbers during training."""
 
     def add(self, steps: int, values: Values) -> None:
         """Note the values after this many policy steps."""
         ...
 
     def close(self, exit_code: int) -> None:
-        """Finish; 0: training came to its end."""
+        """Finish; 0: training ended normally."""
         ...
 
 
 def check(config: TrainConfig) -> None:
-    """Refuse trackers that are asked for and not installed.
+    """Refuse trackers that are configured but not installed.
 
     Raises:
         ConfigError: With the command that installs the tracker.
@@ -50,11 +50,11 @@ def check(config: TrainConfig) -> None:
 def open_trackers(
     config: TrainConfig, folder: Path, tensorboard: Path, after: int | None
 ) -> list[Tracker]:
-    """The trackers of a run: TensorBoard, and those that are asked for.
+    """The trackers of a run: TensorBoard and the configured ones.
 
     Args:
-        config: Configuration; it is handed to the trackers.
-        folder: Run folder; a resumed run finds its entry in the trackers by a file.
+        config: Configuration; the trackers store it.
+        folder: Run folder; a file in it names the entry of a resumed run.
         tensorboard: Folder of TensorBoard's event files.
         after: Policy steps that a resumed run keeps; None: it is new.
     """
@@ -67,17 +67,17 @@ def open_trackers(
 
 
 class TensorBoard:
-    """Event files, written in this thread: an error is raised where it can be met.
+    """Event files, written in this thread, so that the caller sees an error.
 
-    tensorboardX's own writer hands events to a thread; once that has met a full disk,
-    the queue to it fills up and training would wait for ever.
+    tensorboardX's own writer passes events to a thread. When that thread meets a full
+    disk, its queue fills up and training would wait for ever.
     """
 
     FLUSH_INTERVAL = 10.0
     """Seconds between writes to the disk."""
 
     def __init__(self, folder: Path, after: int | None):
-        """Begin an event file; those before it lose what comes later than `after`."""
+        """Begin an event file; older files lose what is later than `after`."""
         folder.mkdir(parents=True, exist_ok=True)
         self._writer = EventsWriter(str(folder / "events"), f".{uuid.uuid4().hex[:8]}")
         self._flushed = time.monotonic()
@@ -156,7 +156,7 @@ class MLflow:
 
 
 def _remembered(path: Path, make: Callable[[], str]) -> str:
-    """The name in a file, made where there is none yet."""
+    """The name in a file; a new one is written if there is none."""
     if not path.exists():
         write_text(path, make())
     return path.read_text()

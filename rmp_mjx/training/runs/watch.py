@@ -1,4 +1,4 @@
-"""What a run watches itself for: bad numbers, and contacts that were not read."""
+"""Checks of every iteration: non-finite numbers, and contacts that were not read."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -14,13 +14,13 @@ from rmp_mjx.training.runs.metrics import SEED, Row
 from rmp_mjx.training.learning.state import TrainState
 
 MAX_LOST_FRACTION = 0.5
-"""Training stops where more of an iteration's steps than this become non-finite."""
+"""Training stops if a larger share of an iteration's steps becomes non-finite."""
 MAX_DUMPS = 5
 """Non-finite steps of a run that are written to files."""
 
 
 class Watch:
-    """Looks at every iteration; says and writes what it finds."""
+    """Checks every iteration; reports and writes what it finds."""
 
     def __init__(self, config: TrainConfig, folder: Path, note: Callable[[str], None]):
         """Nothing has happened yet.
@@ -28,20 +28,20 @@ class Watch:
         Args:
             config: Validated configuration.
             folder: Run folder.
-            note: Called with a line for each finding, each kind once.
+            note: Called with one line for each kind of finding, once.
         """
         self._config = config
         self._folder = folder / run_folder.NONFINITE
         self._note = note
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
-    def _tell(self, kind: str, message: str) -> None:
-        if kind not in self._told:
-            self._told.add(kind)
+    def _once(self, kind: str, message: str) -> None:
+        if kind not in self._reported:
+            self._reported.add(kind)
             self._note(message)
 
-    def verdict(self, rows: Sequence[Row]) -> str | None:
-        """Why training cannot go on after an iteration; None: it can."""
+    def abort_reason(self, rows: Sequence[Row]) -> str | None:
+        """Why training must stop after an iteration; None: it can continue."""
         config = self._config
         updates = config.num_updates_per_batch * config.num_minibatches
         for row in rows:
@@ -59,16 +59,16 @@ class Watch:
             return f"iteration {row['iteration']}{seed}: {cause}"
         return None
 
-    def look(self, rows: Sequence[Row], fault: faults.Fault | None) -> None:
+    def report(self, rows: Sequence[Row], fault: faults.Fault | None) -> None:
         """Report an iteration's findings.
 
         Args:
             rows: Its rows, one for each seed.
-            fault: Its faults, fetched only where the rows count any.
+            fault: Its faults, fetched only if the rows count any.
         """
         overflow = max(row.get("episode/contact_overflow") or 0.0 for row in rows)
         if overflow:
-            self._tell(
+            self._once(
                 "overflow",
                 "warning: a pair of bodies had more contacts than are read: the forces "
                 "of these episodes are too low (column episode/contact_overflow)",
@@ -78,7 +78,7 @@ class Watch:
                 self._dump(row, k, seeds.of_seed(fault, k, self._config))
 
     def _dump(self, row: Row, index: int, fault: faults.Fault) -> None:
-        """Write faults for a replay, as long as there are few."""
+        """Write the first few faults for a replay."""
         config = self._config
         room = MAX_DUMPS - len(list(self._folder.glob("*.npz")))
         seed = config.seed + index
@@ -91,19 +91,19 @@ class Watch:
         try:
             files = faults.dump(fault, self._folder, name, about, max(room, 0))
         except OSError as error:
-            self._tell("dump", f"warning: {self._folder} cannot be written: {error}")
+            self._once("dump", f"warning: {self._folder} cannot be written: {error}")
             return
         if files:
-            self._tell(
+            self._once(
                 "nonfinite",
                 f"warning: iteration {row['iteration']}: {row['nonfinite_envs']} "
                 "environments became non-finite and were reset, their steps left out; "
-                f"look into it with\n  python -m benchmarks.replay {files[0]}",
+                f"inspect it with\n  python -m benchmarks.replay {files[0]}",
             )
 
 
 def is_finite(state: TrainState) -> bool:
-    """Whether all that has been learned is finite."""
+    """Whether everything that has been learned is finite."""
     learned = state.learner, state.normalizer, state.scale
     leaves = jax.device_get(jax.tree.leaves(learned))
     return all(np.isfinite(leaf).all() for leaf in leaves)

@@ -109,7 +109,7 @@ def test_contacts_that_were_not_read_are_said_once(tmp_path):
     notes = []
     watching = watch.Watch(CONFIG, tmp_path, notes.append)
     for share in (None, 0.0, 0.25, 0.5):
-        watching.look([row(**{"episode/contact_overflow": share})], None)
+        watching.report([row(**{"episode/contact_overflow": share})], None)
     (said,) = notes
     assert "more contacts than are read" in said
 
@@ -120,5 +120,5 @@ def test_training_goes_on_with_some_skipped_updates_and_not_without_any_other(tm
     some, all_of_them = (
         row(**{"learning/skipped_updates": float(n)}) for n in (updates - 1, updates)
     )
-    assert watching.verdict([some]) is None
-    assert "non-finite gradients" in watching.verdict([some, all_of_them])
+    assert watching.abort_reason([some]) is None
+    assert "non-finite gradients" in watching.abort_reason([some, all_of_them])

@@ -122,7 +122,7 @@ def test_a_run_that_was_killed_before_its_first_save_begins_anew(finished, tmp_p
     folder = copy_of(finished, tmp_path)
     shutil.rmtree(folder / run_folder.CHECKPOINTS)
     result, config, said = resume(folder)
-    assert "nothing saved yet and begins anew" in said
+    assert "has no checkpoint yet and begins anew" in said
     assert "training on " in said
     assert result.iterations == ITERATIONS
     one, two = (newest_state(f, config)[1] for f in (folder, finished[0]))
