@@ -51,7 +51,7 @@ def evaluate_seeds(
     record = evaluate.recorder(env, config.eval_episodes, filmed)
     about = {"agent": "policy", "deterministic": config.eval_deterministic}
     columns, tapes = [], []
-    for k, place in enumerate(seeds.folders(config, folder)):
+    for k, place in enumerate(run_folder.seed_folders(config, folder)):
         results, tape = record(seeds.of_seed(agent, k, config), key)
         tapes.append(tape)
         if primary:

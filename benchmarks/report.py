@@ -27,7 +27,6 @@ from matplotlib.figure import Figure
 
 from rmp_mjx.training.config import RESUMABLE, TrainConfig, load_config
 from rmp_mjx.training.evaluation.figures import curves
-from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.metrics import SEED, over_seeds
 from rmp_mjx.training.stats import bootstrap_mean, clopper_pearson
@@ -117,7 +116,7 @@ def read_run(folder: Path) -> list[Run]:
     if SEED not in rows.columns:
         rows = rows.with_columns(pl.lit(config.seed).alias(SEED))
     runs = []
-    for k, place in enumerate(seeds.folders(config, folder)):
+    for k, place in enumerate(run_folder.seed_folders(config, folder)):
         own = rows.filter(pl.col(SEED) == config.seed + k)
         file = place / run_folder.EVALUATION
         evaluation = json.loads(file.read_text()) if file.exists() else {}

@@ -5,7 +5,6 @@ With one seed the axis is not there: nothing differs from training a single agen
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +17,6 @@ from rmp_mjx.training.learning import devices
 from rmp_mjx.training.learning.ppo import PPO, make_ppo
 from rmp_mjx.training.learning.rollout import Env
 from rmp_mjx.training.learning.state import TrainState
-from rmp_mjx.training.runs import run_folder
 
 
 class Programs(NamedTuple):
@@ -51,14 +49,6 @@ def title(config: TrainConfig) -> str:
     return f"seed {first}" if last == first else f"seeds {first} to {last}"
 
 
-def folders(config: TrainConfig, folder: Path) -> list[Path]:
-    """Where each seed's own results go: the run's folder itself where it has one."""
-    if config.num_seeds == 1:
-        return [folder]
-    numbers = range(config.seed, config.seed + config.num_seeds)
-    return [folder / run_folder.SEEDS / str(number) for number in numbers]
-
-
 def programs(env: Env, config: TrainConfig) -> Programs:
     """Compile PPO for all seeds; the devices share every agent's environments.
 
@@ -71,9 +61,9 @@ def programs(env: Env, config: TrainConfig) -> Programs:
     seeded = int(config.num_seeds > 1)
     many = jax.vmap if seeded else lambda function: function
     whole = devices.placed(mesh, None)
-    lies: dict[str, Any] = {f.name: whole for f in dataclasses.fields(TrainState)}
-    lies["rollout"] = devices.placed(mesh, seeded)
-    state = TrainState(**lies)
+    shardings: dict[str, Any] = {f.name: whole for f in dataclasses.fields(TrainState)}
+    shardings["rollout"] = devices.placed(mesh, seeded)
+    state = TrainState(**shardings)
     data = devices.placed(mesh, seeded + 1)
     return Programs(
         ppo=ppo,

@@ -126,6 +126,14 @@ def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
     return folder, lock
 
 
+def seed_folders(config: TrainConfig, folder: Path) -> list[Path]:
+    """Where each seed's own results go; the run's folder itself for a single seed."""
+    if config.num_seeds == 1:
+        return [folder]
+    numbers = range(config.seed, config.seed + config.num_seeds)
+    return [folder / SEEDS / str(number) for number in numbers]
+
+
 def _lock(folder: Path) -> IO[str]:
     """Take the folder's lock; the system releases it when the process ends."""
     lock = (folder / LOCK).open("a+")
