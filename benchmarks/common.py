@@ -43,13 +43,13 @@ class Row:
     """One measured figure."""
 
     key: str
-    """Stable name of what was measured; comparisons between runs go by it."""
+    """Stable name of the figure; runs are compared by it."""
     value: float
     """The figure."""
     unit: str
     """Its unit."""
     note: str
-    """What is needed to read it: sizes, method, spread."""
+    """What a reader needs to know: sizes, method, spread."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Timing:
     """Times of repeated calls of one compiled function."""
 
     compile_s: float
-    """Trace, lower and compile; the first call is not in it. [s]"""
+    """Time to trace, lower and compile, without the first call. [s]"""
     calls_s: np.ndarray
     """Wall time of each call, result ready. (n,) [s]"""
 
@@ -115,7 +115,7 @@ def time_calls(
     """Time the calls of a compiled program with the result awaited, as `measure` does.
 
     Returns:
-        Wall time of each call; of the first alone where that takes too long. (n,) [s]
+        Wall time of each call; of the first only, if it takes too long. (n,) [s]
     """
     start = time.perf_counter()
     jax.block_until_ready(compiled(*args))  # buffers, thread pools, page faults
@@ -155,12 +155,12 @@ def measure_calls(
 def on_all_devices(
     function: Callable[..., Any], size: int, in_axes: Sequence[int | None]
 ) -> Callable[..., Any]:
-    """Vectorise a function, its batch shared by all devices of this process.
+    """Vectorise a function; all devices of this process share the batch.
 
     Args:
         function: For one element.
         size: Elements of a batch.
-        in_axes: 0 for each argument that has an axis of elements, None for others.
+        in_axes: 0 for each argument with an axis of elements, None for the others.
     """
     mesh = devices.local_mesh(size)
     batched = jax.vmap(function, in_axes=tuple(in_axes))
@@ -216,7 +216,7 @@ def machine() -> dict[str, Any]:
 
 
 def write_json(path: Path, rows: Iterable[Row], **settings: Any) -> None:
-    """Write rows with all that is needed to repeat them.
+    """Write rows with everything needed to repeat them.
 
     Args:
         path: The file; its folder is made.
@@ -288,7 +288,7 @@ def markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
 
 
 def insert(text: str, tables: Mapping[str, str]) -> str:
-    """Replace what stands between a page's `<!-- name -->` and `<!-- end -->`.
+    """Replace the text between a page's `<!-- name -->` and `<!-- end -->`.
 
     Raises:
         ValueError: The page has no place for a table.

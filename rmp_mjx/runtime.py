@@ -46,8 +46,7 @@ class Runtime:
     cache_dir: Path | None
     """Folder of the persistent compilation cache; None where it is off."""
     gl: str | None
-    """MuJoCo's rendering backend; None where rendering was not asked for or none
-    works on this machine."""
+    """MuJoCo's rendering backend; None if it was not requested or none works here."""
 
 
 def configure(
@@ -58,7 +57,7 @@ def configure(
     cache_dir: str | os.PathLike[str] | None = None,
     rendering: bool = False,
 ) -> Runtime:
-    """Prepare this process; call it before anything asks JAX for a device.
+    """Prepare this process; call it before the first JAX operation.
 
     Safe to call more than once. Settings that the user made (``XLA_FLAGS``,
     ``JAX_NUM_CPU_DEVICES``, ``JAX_COMPILATION_CACHE_DIR``, ``MUJOCO_GL``) always win.
@@ -66,8 +65,8 @@ def configure(
     Args:
         cpu_flags: Append the CPU flags that this jaxlib release needs for fast
             kinematics. They do not affect a GPU.
-        split_cpu: Make every core that this process may use a device of its own, for
-            programs that share their work among devices (`jax.sharding`). XLA hardly
+        split_cpu: Make every core that this process may use a separate device, for
+            programs that divide their work among devices (`jax.sharding`). XLA hardly
             spreads one program over several cores.
         compile_cache: Keep compiled programs on disk between runs.
         cache_dir: Folder of that cache. By default
@@ -77,11 +76,11 @@ def configure(
             display.
 
     Returns:
-        What is in force. ``gl`` is None where rendering cannot work here.
+        The settings in force. ``gl`` is None if rendering cannot work here.
 
     Warns:
-        RuntimeWarning: The JAX backend is already running, so XLA flags can no
-            longer take effect; or the cache folder cannot be written.
+        RuntimeWarning: The JAX backend is already running, so XLA flags have no
+            effect; or the cache folder cannot be written.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if cpu_flags:
@@ -125,7 +124,7 @@ def merge_flags(current: str, extra: tuple[str, ...]) -> str:
 
 
 def default_cache_dir() -> Path:
-    """Folder of the compilation cache where neither caller nor user names one."""
+    """Folder of the compilation cache if neither caller nor user names one."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "rmp_mjx" / "xla"
 
@@ -158,8 +157,8 @@ def choose_gl() -> str | None:
 def gl_loads(name: str) -> bool:
     """Whether a MuJoCo rendering backend can open a context on this machine.
 
-    Tried in a process of its own: a broken graphics stack may crash, and PyOpenGL
-    keeps the first platform that it is imported with.
+    Tried in a separate process: a broken graphics stack may crash, and PyOpenGL keeps
+    the first platform that it is imported with.
     """
     probe = subprocess.run(
         [sys.executable, "-c", "import mujoco; mujoco.GLContext(8, 8).free()"],
@@ -172,7 +171,7 @@ def gl_loads(name: str) -> bool:
 
 
 def _split_cpu(flags: str) -> None:
-    """One CPU device a core, where the user has not said otherwise."""
+    """One CPU device per core, unless the user has chosen otherwise."""
     forced = "--xla_force_host_platform_device_count" in flags
     chosen = jax.config.jax_num_cpu_devices >= 0  # pyright: ignore
     if not (forced or chosen or _backend_is_running()):

@@ -1,6 +1,6 @@
 """Ours against its peers, in one run on one machine: ``python -m benchmarks.peers``.
 
-Each contestant is a process that measures when it is told to, in a virtual environment
-of its own (`venv`), so that they can take turns (`worker`). One file per contestant:
-its module docstring says what is measured and how it is kept fair.
+Each contestant is a process that measures on command, in its own virtual environment
+(`venv`), so that they can take turns (`worker`). Each has one file, whose docstring
+says what is measured and how the comparison is kept fair.
 """

@@ -1,8 +1,8 @@
-"""The driver: contestants side by side, taking turns.
+"""The driver: contestants take turns.
 
 Each comparison names our measure and a peer's. All processes are started and made ready
-first; then they measure in turn, ours, theirs, ours, ..., so that what slows the
-machine for a while slows both. A ratio is the median over the rounds of ours over
+first. Then they measure in turn, ours, theirs, ours, ..., so that a slow minute of the
+machine slows both. A ratio is the median over the rounds of ours over
 theirs, with its quartiles.
 """
 
@@ -33,7 +33,7 @@ class Peer:
     module: str
     """Its file in this package."""
     requirements: tuple[str, ...]
-    """What pip installs for it."""
+    """Its requirements for pip."""
     xla_flags: str = ""
     """XLA flags, for a peer that runs JAX."""
 
@@ -43,7 +43,7 @@ class Comparison:
     """One ratio: ours over theirs for a rate, theirs over ours for a time."""
 
     key: str
-    """Of the row, without the prefix ``ratio_``."""
+    """Key of the row, without the prefix ``ratio_``."""
     ours: str
     """Our measure."""
     peer: str
@@ -57,7 +57,7 @@ class Comparison:
 
 
 FLAGS = " ".join(runtime.cpu_xla_flags())
-"""The CPU flags that ours runs with; peers on the same release of jaxlib get them."""
+"""Our CPU flags; peers on the same release of jaxlib get them too."""
 
 PEERS = (
     Peer(
@@ -121,7 +121,7 @@ FLOOR = {
     "env_physics_mujoco": "the whole environment's physics steps, C engine, 1024",
     "env_physics_mjx": "the whole environment's physics steps, MJX, 256",
 }
-"""Bare physics, for what a step costs besides it."""
+"""Bare physics, as a lower bound of a step's cost."""
 
 
 def compare(
@@ -194,7 +194,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Compare, print, and write where asked to; a peer that fails is reported."""
+    """Compare, print, and write the requested files; a peer that fails is reported."""
     args = parse(argv)
     runtime.configure()
     rounds, seconds = (1, 0.5) if args.quick else (args.rounds, 1.5)

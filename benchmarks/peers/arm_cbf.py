@@ -1,12 +1,12 @@
 """frax and CBFpy: operational-space torque control of a 7-DOF arm, bare and filtered.
 
 ``osc`` is an operational-space impedance controller with a null-space posture on frax's
-Franka Panda, from one call of its `torque_control_matrices`: it answers to our VICES.
-``osc_cbf`` sends it through CBFpy's safety filter, a quadratic program over the torques
-with second-order barriers for every collision sphere of the arm against five obstacle
-spheres and for the joint limits: it answers to our RMP-VICES. The arms, the numbers of
-spheres (frax's own model of the Panda) and the safety notions differ; the question
-(safe torques from a joint state, set-point and obstacles) is the same.
+Franka Panda, from one call of its `torque_control_matrices`: the counterpart of our
+VICES. ``osc_cbf`` sends it through CBFpy's safety filter, a quadratic program over the
+torques with second-order barriers for every collision sphere of the arm against five
+obstacle spheres and for the joint limits: the counterpart of our RMP-VICES. The arms,
+the numbers of spheres (frax's own model of the Panda) and the notions of safety differ.
+The problem (safe torques from a joint state, set-point and obstacles) is the same.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The same task, sizes, epochs and minibatches as ours (`point_mass.SETTINGS`). Brax's
 `train` compiles when it starts, so its rate is taken from its own clock
 (``training/sps``, compilation left out) in the last of two epochs of a fixed length;
-the time to spend is not asked for.
+the time budget is ignored.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The driver's side of a `worker`: start it, ask it, end it."""
+"""The driver's side of a `worker`: start it, query it, stop it."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class PointTask:
 
     @property
     def metric_reductions(self) -> dict[str, str]:
-        """The metrics that a trainer asks for."""
+        """Metrics, as a trainer needs them."""
         return {"success": "max", "collision": "sum"}
 
     def reset(self, rng):
@@ -174,7 +174,7 @@ def _at_home():
 
 
 def measures() -> dict[str, Callable[[], Measure]]:
-    """Everything that ours can measure, by name."""
+    """All of our measures by name."""
 
     def throughput(make):
         return lambda: rate(torques(make, BATCH), BATCH)

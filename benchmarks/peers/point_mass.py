@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from rmp_mjx.pytree import Pytree
 
 OBSERVATION_SIZE = 34
-"""As many as the trajectory task's."""
+"""Size of the trajectory task's observation."""
 
 ACTION_SIZE = 12
-"""As many as every task's."""
+"""Size of every task's action."""
 
 SETTINGS: dict[str, Any] = {
     "num_envs": 256,
@@ -29,11 +29,11 @@ SETTINGS: dict[str, Any] = {
     "gae_lambda": 0.97,
     "target_kl": 0.0,
 }
-"""Of both trainers."""
+"""Settings of both trainers."""
 
 
 class Point(Pytree):
-    """Position and velocity, observed with zeros besides; the goal is the origin."""
+    """Position and velocity, observed with zero padding; the goal is the origin."""
 
     pipeline_state: jax.Array
     obs: jax.Array

@@ -18,12 +18,12 @@ BARRIER = ("mu", "eps", "eta", "r", "margin", "x_min", "cap", "k_out", "v_out")
 
 
 def controller(robot: rmp.Robot) -> rmp.RMPVICES:
-    """Our controller without what RMP2 has no counterpart for."""
+    """Our controller without the parts that RMP2 lacks."""
     return rmp.RMPVICES(robot, self_collision=None, yielding=None, limit_yielding=None)
 
 
 def arrays(seed: int) -> dict[str, Any]:
-    """The arm, its control points, the leaves, a batch of states, our answer.
+    """The arm, its control points, the leaves, a batch of states, our result.
 
     Float64, SI units; states have a leading batch axis. ``regularizer`` is the inertia
     matrix, metric of posture and regulariser; ``posture`` is (stiffness, damping,
@@ -84,6 +84,6 @@ def write(path: Path, seed: int) -> None:
 
 
 def double(x) -> jax.Array:
-    """An array in float64 if it is one of numbers that are not whole."""
+    """Convert an array of floating-point numbers to float64."""
     x = np.asarray(x)
     return jnp.asarray(x, jnp.float64 if x.dtype.kind == "f" else x.dtype)

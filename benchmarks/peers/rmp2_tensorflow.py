@@ -5,11 +5,11 @@ forward map from the joints to all leaf coordinates; velocities and curvatures b
 differentiating reverse mode twice; the root's force as the gradient of the leaves'
 forces dotted with the coordinates, the root's metric as the Jacobian of a gradient.
 
-The tree is ours without self-collision and yielding: the same arm, control points,
-obstacles, leaves and regulariser, so that the accelerations must agree. Inertia and
-dynamics are handed in (`problem`): what remains is the policy itself, while ours is
+The tree is ours without self-collision and relaxed orientation: the same arm, control
+points, obstacles, leaves and regulariser, so that the accelerations must agree. Inertia
+and dynamics are given (`problem`). What remains is the policy itself, while ours is
 timed with its dynamics and torques. Throughput is that of a graph (``tf.function``, as
-in the authors' code) and of the same compiled by XLA; one state is only timed with XLA,
+in the authors' code) and of the same compiled by XLA. One state is only timed with XLA,
 because the graph corrupts TensorFlow's heap (2.19 and 2.21) at a batch of one.
 """
 
@@ -30,7 +30,7 @@ class Policy:
     """The tree of one `problem`; all tensors have a leading batch axis."""
 
     def __init__(self, problem):
-        """Take the constants over."""
+        """Copy the constants."""
         self.problem = problem
 
     def constant(self, name: str):

@@ -1,9 +1,9 @@
 """robosuite 1.5.2: door opening with a Jaco under OSC with variable stiffness.
 
-Its defaults: 20 Hz, 25 physics steps of 2 ms, the controller at each of them; without
-renderer or cameras, no resets in the time measured. robosuite steps one environment a
-process, so one process per core runs side by side, as its users would do; the figure is
-the sum of their rates.
+Its defaults: 20 Hz, 25 physics steps of 2 ms, the controller at each of them. There are
+no renderer, no cameras, and no resets in the measured time. robosuite steps one
+environment per process, so one process per core runs in parallel, as its users would
+do. The figure is the sum of their rates.
 """
 
 from __future__ import annotations

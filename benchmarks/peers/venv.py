@@ -23,7 +23,7 @@ def folder() -> Path:
 
 
 def python(name: str, requirements: Sequence[str]) -> Path:
-    """The interpreter of a peer's environment; makes it where it is missing or stale.
+    """The interpreter of a peer's environment; makes it if it is missing or stale.
 
     Args:
         name: The peer; its environment's folder.

@@ -1,8 +1,8 @@
 """A contestant's side: a process that measures on demand. Standard library only.
 
-Every contestant runs ``serve`` in its own virtual environment. The driver asks through
-its standard input and is answered through a pipe of its own, for libraries print to the
-standard output; one JSON object per line.
+Every contestant runs ``serve`` in its own virtual environment. The driver sends
+requests to its standard input and reads answers from a separate pipe, because libraries
+print to the standard output. Each message is one JSON object on a line.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ ANSWERS = "BENCHMARK_ANSWERS"
 """Environment variable with the file descriptor of the pipe."""
 
 Measure = Callable[[float], float]
-"""From seconds to spend to the figure."""
+"""Maps a time budget [s] to the figure."""
 
 
 def serve(makers: Mapping[str, Callable[[], Measure]], packages: tuple[str, ...]):
     """Answer the driver until it closes the pipe.
 
     Args:
-        makers: What can be measured: each makes its measure ready (compiled, warm).
-        packages: Whose versions to report.
+        makers: Measures by name; each is prepared (compiled, warm) when called.
+        packages: Packages whose versions are reported.
     """
     answers = os.fdopen(int(os.environ[ANSWERS]), "w")
 
@@ -44,7 +44,7 @@ def serve(makers: Mapping[str, Callable[[], Measure]], packages: tuple[str, ...]
 
 
 def rate(call: Callable[[], object], units: int) -> Measure:
-    """Units a second of a call that returns when its result is there.
+    """Units per second of a call that returns when its result is ready.
 
     Args:
         call: What to repeat; called three times first.

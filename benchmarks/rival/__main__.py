@@ -26,8 +26,8 @@ REQUIREMENTS = (
 CONTROLLERS = ("rmp_vices", "vices")
 
 TOLERANCE = 1e-5
-"""The torques must agree to this share of a joint's limit: both are in float64, and
-differ in the order of sums and, in the closest points, by what cancels there."""
+"""The torques must agree to this share of a joint's limit. Both are in float64; they
+differ in the order of sums and in cancellation at the closest points."""
 
 NOTES = {
     "training": "policy steps of PPO on trajectory, updates included",
@@ -51,7 +51,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def agreement(theirs: Contestant) -> list[Row]:
-    """Rows that say that both compute the same torques.
+    """Rows that show that both compute the same torques.
 
     Raises:
         ContestantError: They do not.
@@ -70,7 +70,7 @@ def agreement(theirs: Contestant) -> list[Row]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Check the agreement, measure in turn, print, and write where asked to."""
+    """Check the agreement, measure in turn, print, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     rounds, seconds = (1, 1.0) if args.quick else (args.rounds, 3.0)

@@ -67,9 +67,9 @@ class Arm(NamedTuple):
     joint_limit: np.ndarray
     """Barrier of the joint-limit leaf."""
     yielding: np.ndarray
-    """(least, near, far) beside obstacles."""
+    """Relaxation near obstacles: (min_weight, near, far)."""
     limit_yielding: np.ndarray
-    """The same near joint limits."""
+    """Relaxation near joint limits."""
     posture: np.ndarray
     """(stiffness, damping, weight, the root's regulariser)."""
     table: float
@@ -215,14 +215,14 @@ def avoid_self(arm, geom_xpos, geom_xmat, S, V, A, f, M):
 
 @njit(fastmath=FAST, cache=True)
 def weight(leaf, room):
-    """Weight of the orientation with this room."""
+    """Weight of the orientation at this distance."""
     least, near, far = leaf[0], leaf[1], leaf[2]
     return least ** min(max(far - room, 0.0) / (far - near), 1.0)
 
 
 @njit(fastmath=FAST, cache=True)
 def impedance(arm, fields, e, p_des, R_des, kp, S, V, pull, J):
-    """Accelerations that the impedance asks for, (6,), and the Jacobian's rows."""
+    """Accelerations of the impedance target, (6,), and the Jacobian's rows."""
     site, R = fields.site_xpos[e, arm.site], fields.site_xmat[e, arm.site]
     last, v = V[N - 1], np.empty(3)
     for k in range(3):

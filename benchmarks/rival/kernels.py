@@ -1,4 +1,4 @@
-"""Compiled pieces that the rival's controllers are made of.
+"""Compiled building blocks of the rival's controllers.
 
 Spatial vectors are about the world's origin, linear part first.
 """

@@ -50,7 +50,7 @@ def training(name: str, num_envs: int) -> Measure:
 
 
 def measures(num_envs: int) -> dict[str, Callable[[], Measure]]:
-    """Everything to measure, by name."""
+    """Measures by name."""
     found: dict[str, Callable[[], Measure]] = {}
     for name in CONTROLLERS:
         found[f"evals_{name}"] = partial(evals, name)

@@ -33,7 +33,7 @@ class Moments:
         self.mean, self.var, self.count = np.zeros(size), np.ones(size), 1e-4
 
     def add(self, x: np.ndarray) -> None:
-        """Take a batch into account (Chan et al., 1979)."""
+        """Update with a batch (Chan et al., 1979)."""
         n, step = len(x), x.mean(axis=0) - self.mean
         total = self.count + n
         spread = self.var * self.count + x.var(axis=0) * n

@@ -1,4 +1,4 @@
-"""What the rival is given: the scene, the arm's constants, and states to agree on."""
+"""The rival's input: the scene, the arm's constants, and states to compare."""
 
 from __future__ import annotations
 

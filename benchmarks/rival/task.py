@@ -1,8 +1,7 @@
 """The trajectory task in NumPy on MuJoCo's batch of C simulations.
 
-The same scene, start, via points, observation, reward and ends as ours. What it leaves
-out of our environment is the rest of the safety record (forces, clearance, smoothness
-of the torques).
+Scene, start, via points, observation, reward and terminations are ours. It leaves out
+the rest of our safety record (forces, clearance, smoothness of the torques).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ Controller = Callable[..., None]
 
 @dataclass
 class Steps:
-    """What a policy step leads to, a row for each environment."""
+    """Result of a policy step, one row per environment."""
 
     obs: np.ndarray
     """Observation; of the new episode where one ended."""
@@ -46,7 +45,7 @@ class Steps:
 
 
 class Trajectory:
-    """A batch of environments that start anew by themselves."""
+    """A batch of environments with automatic resets."""
 
     def __init__(
         self, model: mujoco.MjModel, arm: Arm, controller: Controller, size: int
@@ -107,7 +106,7 @@ class Trajectory:
         return p_des, R_des, 10.0 * 30.0 ** (0.5 * (action[:, 6:] + 1.0))
 
     def step(self, action: np.ndarray) -> Steps:
-        """One policy step of every environment; ended ones start anew."""
+        """One policy step of every environment; finished ones are reset."""
         setpoint = self.setpoint(action)
         event = np.zeros(self.size, bool)
         for _ in range(SUBSTEPS):

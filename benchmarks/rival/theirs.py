@@ -1,4 +1,4 @@
-"""The rival as a contestant: runs in a virtual environment of its own."""
+"""The rival as a contestant, in its own virtual environment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONTROLLERS = {"rmp_vices": controller.rmp_vices, "vices": controller.vices}
 
 
 class Rival:
-    """All that can be measured of it.
+    """The measures of the rival.
 
     Args:
         scene: The compiled scene.

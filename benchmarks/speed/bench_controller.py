@@ -138,7 +138,7 @@ def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure(cpu_flags=not args.worker, split_cpu=True, compile_cache=False)
     rows = measure_all(args.quick, args.seed, autodiff=not args.worker)

@@ -81,7 +81,7 @@ def measure_engine(
 
 
 def controller_time(env, state, action, seconds: float) -> float:
-    """Seconds that the controller's evaluations of one policy step take alone."""
+    """Time of the controller's evaluations of one policy step alone [s]."""
     ctrl, n = env.controller, env.robot.n
 
     def torques(data, spheres, action):
@@ -102,7 +102,7 @@ def controller_time(env, state, action, seconds: float) -> float:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure(split_cpu=True, compile_cache=False)
     sizes = (64,) if args.quick else tuple(args.num_envs)

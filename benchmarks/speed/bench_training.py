@@ -79,7 +79,7 @@ def iterations(config: TrainConfig) -> Iterator[tuple[float, float]]:
 
 
 def iterate(config: TrainConfig, count: int) -> Times:
-    """So many iterations, timed once the program runs smoothly."""
+    """Time iterations after the first, slower ones."""
     times = itertools.islice(iterations(config), WARM_UP, WARM_UP + count)
     return Times(*np.array(list(times)).T)
 
@@ -99,7 +99,7 @@ def speed(config: TrainConfig, count: int) -> list[Row]:
 
 
 def cost_of_seeds(config: TrainConfig, count: int) -> list[Row]:
-    """Time of several seeds in one program over that of one."""
+    """Time of several seeds in one program, relative to one seed."""
     whole = []
     for num_seeds in (1, SEEDS):
         config = dataclasses.replace(config, num_envs=SEED_ENVS, num_seeds=num_seeds)
@@ -132,7 +132,7 @@ def first_steps(seed: int, num_devices: int | None) -> list[Row]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure(split_cpu=True, compile_cache=args.first_step is not None)
     config = TrainConfig(seed=args.seed, num_devices=args.num_devices)

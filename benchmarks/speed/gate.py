@@ -1,8 +1,9 @@
 """The regression gate: ``python -m benchmarks.gate``, exit code 1 if speed is lost.
 
-Only figures that another machine, or a busy one, repeats: ratios of two speeds that are
-measured in turn on the same machine, and counts of the compiled programs. Each may be
-worse than the committed baseline by a stated factor. ``--update`` writes the baseline.
+Only figures that another machine, or a busy one, can repeat: ratios of two speeds that
+are measured in turn on the same machine, and counts of the compiled programs. Each may
+be worse than the committed baseline by a stated factor. ``--update`` writes the
+baseline.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ class Check:
     """A figure that is watched."""
 
     key: str
-    """Of its row."""
+    """Key of its row."""
     better: str
     """Whether `HIGHER` or `LOWER` is better."""
     factor: float
     """How many times worse than the baseline it may be, >= 1."""
     meaning: str
-    """What it is."""
+    """Its description."""
     compiled: bool = False
     """Whether it depends on jax's version: not compared across versions."""
 
@@ -61,7 +62,7 @@ class Ratio:
     above: str
     """Measure of `benchmarks.peers.ours`."""
     below: str
-    """Another one, or the same."""
+    """Measure that it is divided by; may be the same."""
     above_default: bool = False
     """Whether `above` runs with XLA's default flags."""
 
@@ -126,7 +127,7 @@ COUNTS = (
 def measure_ratios(
     ratios: Sequence[Ratio], rounds: int, seconds: float
 ) -> dict[str, float]:
-    """Median over the rounds of each ratio; the order turns round every time."""
+    """Median over the rounds of each ratio; the order alternates."""
     module = "benchmarks.peers.ours"
     tuned = Contestant(module)
     default = Contestant(module, [DEFAULT_FLAGS])
@@ -207,7 +208,7 @@ def judge(
     Args:
         checks: What to compare.
         baseline: Figures of the baseline.
-        now: Figures now; those that are missing were not measured.
+        now: Figures now; missing ones were not measured.
         same_jax: Whether both come from one version of jax.
     """
     verdicts = []
@@ -228,7 +229,7 @@ def judge(
 
 
 def table(verdicts: Sequence[Verdict]) -> Table:
-    """The verdicts to read."""
+    """The verdicts as a table."""
     found = Table(title="Speed against the baseline")
     for column in ("figure", "baseline", "now", "worse", "allowed", "", "meaning"):
         right = column in ("baseline", "now", "worse", "allowed")

@@ -1,11 +1,11 @@
 """One sweep on an accelerator: `python -m benchmarks.gpu --json F`.
 
-Correctness first (torques against float64 on the host's CPU), then the controller's and
-the environment's throughput on MJX and, where it is installed, on Warp; then PPO's with
-one learning run each. Each part is a process; all compile at the same time and measure
-in turn, so that the sweep takes minutes. What a part finds is written at once, and one
-that fails says why and does not stop the others. `--grid` does the same for the cells
-of the paper's grid.
+Torques are checked first, against float64 on the host's CPU. Then follow the throughput
+of the controller and of the environment on MJX and, if it is installed, on Warp, and of
+PPO with one learning run each. Each part is a process. All compile at the same time and
+measure in turn, so that the sweep takes minutes. A part's rows are written at once; a
+part that fails says why and does not stop the others. `--grid` does the same for the
+cells of the paper's grid.
 """
 
 from __future__ import annotations
@@ -50,17 +50,17 @@ ITERATIONS = 20
 """Iterations by which a cell of the grid is timed."""
 
 Part = Callable[[], list[Row]]
-"""Measures what was compiled for it."""
+"""Measures a compiled part."""
 
 
 class Programs:
-    """Compiles side by side: tracing takes turns, the compiler does not."""
+    """Compiles several programs at once: tracing takes turns, the compiler does not."""
 
     def __init__(self):
         self._pool = ThreadPoolExecutor()
 
     def add(self, function: Callable[..., Any], *args: Any) -> Future:
-        """Begin to compile; the future gives the program and its seconds.
+        """Start to compile; the future gives the program and its compile time [s].
 
         Args:
             function: What to jit.
@@ -171,7 +171,7 @@ def environment(
 def iterate(
     step: Callable[[Any], Any], state: Any, count: int
 ) -> tuple[Any, list[Any], list[float]]:
-    """So many iterations of PPO: the last state, their statistics, their seconds."""
+    """Iterate PPO: the last state, the statistics and the seconds of each iteration."""
     stats, times = [], []
     for _ in range(count):
         begin = time.perf_counter()
@@ -184,7 +184,7 @@ def iterate(
 def training(
     programs: Programs, physics: str, num_envs: int, steps: int, episodes: int
 ) -> Part:
-    """Train RMP-VICES on trajectory following; evaluate the policy if asked to."""
+    """Train RMP-VICES on trajectory following, and evaluate the policy if wanted."""
     config = TrainConfig(
         physics=physics, num_envs=num_envs, num_timesteps=steps, num_minibatches=16
     )
@@ -261,7 +261,7 @@ def cell(programs: Programs, physics: str, preset: Preset, own: Cell) -> Part:
 def work(
     part: Callable[[Programs], Part], compiled: Barrier, turn: Lock
 ) -> list[Row] | str:
-    """Compile a part in a process of its own, wait for the others, measure in turn.
+    """Compile a part in its own process, wait for the others, measure in turn.
 
     Returns:
         Its rows, or why it failed.
@@ -279,7 +279,7 @@ def work(
 
 
 def engines() -> list[str]:
-    """Physics engines for an accelerator that are installed."""
+    """Installed physics engines that run on an accelerator."""
     try:
         sim.require("warp")
     except sim.PhysicsError:

@@ -1,7 +1,7 @@
 """How cost grows with the problem: ``python -m benchmarks.scaling --json F --plot P``.
 
 Environments, control points, obstacles, joints: one curve each, with the exponent p of
-time ~ size^p fitted to the upper half of the sizes. Memory comes along.
+time ~ size^p fitted to the upper half of the sizes. Memory is measured too.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def controller_time(
 
 
 def spheres(number: int) -> rmp.Obstacles:
-    """So many spheres of 5 cm in the arm's reach."""
+    """Spheres of 5 cm in the arm's reach."""
     rng = np.random.default_rng(0)
     angle = rng.uniform(-np.pi, np.pi, number)
     height = rng.uniform(0.0, 0.6, number)
@@ -113,7 +113,7 @@ def spheres(number: int) -> rmp.Obstacles:
 
 
 def environments(sizes: Sequence[int], seconds: float) -> tuple[Curve, list[Row]]:
-    """A policy step of trajectory (C engine), and what it takes of memory."""
+    """Time of a policy step of trajectory (C engine), and its memory."""
     env = envs.load("trajectory", controller="rmp_vices", physics="mujoco")
     reset, step = jax.jit(jax.vmap(env.reset)), jax.vmap(env.step)
     times, rows = [], []
@@ -128,7 +128,7 @@ def environments(sizes: Sequence[int], seconds: float) -> tuple[Curve, list[Row]
 
 
 def control_points(sizes: Sequence[int], seconds: float) -> Curve:
-    """RMP-VICES with five spheres, control points denser and denser."""
+    """RMP-VICES with five spheres and ever denser control points."""
     found, times = [], []
     for size in sizes:
         robot = _with_points(size)
@@ -138,7 +138,7 @@ def control_points(sizes: Sequence[int], seconds: float) -> Curve:
 
 
 def obstacles(sizes: Sequence[int], seconds: float) -> Curve:
-    """RMP-VICES with more and more spheres; 0 is timed and left out of the curve."""
+    """RMP-VICES with ever more spheres; 0 is timed and left out of the curve."""
     ctrl = rmp.RMPVICES(rmp.Robot.load("jaco2"))
     times = [controller_time(ctrl, spheres(size), seconds) for size in sizes]
     return Curve("obstacles", "evaluation", tuple(sizes), tuple(times))
@@ -155,7 +155,7 @@ def joints(sizes: Sequence[int], seconds: float) -> Curve:
 
 
 def _with_points(wanted: int) -> rmp.Robot:
-    """The Jaco 2 with about so many control points."""
+    """The Jaco 2 with about this number of control points."""
     low, high = 1e-3, 0.5
     for _ in range(12):
         middle = np.sqrt(low * high)
@@ -223,7 +223,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, and write and draw where asked to."""
+    """Measure, print, write and draw the requested files."""
     args = parse(argv)
     runtime.configure(compile_cache=False)
     seconds = 0.1 if args.quick else 2.0

@@ -1,9 +1,9 @@
-"""What sharing the environments among devices costs: forced CPU devices.
+"""The cost of dividing environments among devices, on forced CPU devices.
 
-Run as ``python -m benchmarks.weak_scaling --json FILE``. Each row is a process with so
-many devices, each with as many environments. All devices share this machine's cores, so
-the rate cannot grow beyond them; it is compared with one device that has all of the
-environments.
+Run as ``python -m benchmarks.weak_scaling --json FILE``. Each row is a process with
+several devices and an equal number of environments on each. All devices share this
+machine's cores, so the rate cannot grow beyond them. It is compared with one device
+that has all of the environments.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def seconds(args: argparse.Namespace, num_envs: int, devices: int) -> list[float]:
-    """Medians of roll-out and learner of an iteration, in a process of its own [s]."""
+    """Median times of roll-out and learner in an iteration, in a new process [s]."""
     command = [sys.executable, "-m", "benchmarks.weak_scaling"]
     command += ["--iterations", str(args.iterations)]
     command += ["--worker", str(num_envs), str(devices)]
@@ -52,7 +52,7 @@ def seconds(args: argparse.Namespace, num_envs: int, devices: int) -> list[float
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     if args.worker:

@@ -1,7 +1,7 @@
 """Scripted experts: every task solved through the action space, by every controller.
 
 `python -m benchmarks.experts --json benchmarks/results/experts.json` runs each expert
-from random starts. What no expert can do, no policy will learn.
+from random starts. A policy will not learn what no expert can do.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from rmp_mjx.math import orientation_error
 EVENTS = ("collision", "self_collision", "joint_limit")
 
 DEFAULT = ("rmp_vices", "vices", "rmp_vices_literal")
-"""Controllers that are compared unless others are asked for."""
+"""Controllers that are compared by default."""
 
 
 class Memory(NamedTuple):
-    """What an expert keeps in mind."""
+    """Memory of an expert."""
 
     R: Array
-    """Orientation of the hand at the start, which it keeps, (3, 3)."""
+    """Orientation of the hand, kept from the start, (3, 3)."""
     phase: Array
-    """Where it is in its plan."""
+    """Phase of its plan."""
 
 
 Act = Callable[[Any, State, Memory], tuple[Memory, Array]]
@@ -44,20 +44,20 @@ Act = Callable[[Any, State, Memory], tuple[Memory, Array]]
 
 
 class Case(NamedTuple):
-    """A scene and who solves it."""
+    """A scene and its expert."""
 
     task: str
     """A name in `envs.names()`."""
     act: Act
     """Expert."""
     steps: int
-    """Policy steps it is given."""
+    """Policy steps until the time limit."""
     options: dict[str, Any]
     """Options of the task."""
 
     @property
     def name(self) -> str:
-        """Task and what is special about it."""
+        """Task and its options."""
         return "/".join([self.task, *map(str, self.options.values())])
 
 
@@ -67,7 +67,7 @@ def start(env: ArmEnv, state: State) -> Memory:
 
 
 def command(env: ArmEnv, state: State, R: Array, target: Array) -> Array:
-    """Move the grip straight to a target as fast as the action range goes.
+    """Move the grip straight to a target as fast as the action range allows.
 
     The hand keeps the orientation R; all stiffnesses are the greatest.
     """
@@ -88,8 +88,8 @@ def follow(env: ArmEnv, state: State, memory: Memory) -> tuple[Memory, Array]:
 def pull(env: door.Door, state: State, memory: Memory) -> tuple[Memory, Array]:
     """Door opening: lead the handle by up to a quarter of a radian.
 
-    It leads by twice what is left, so that it pulls hard nearly to the end: a drive
-    that fades out sooner stalls where it falls below the friction of the hinge.
+    It leads by twice the remaining angle, so that it pulls hard nearly to the end. A
+    force that fades sooner stalls when it falls below the friction of the hinge.
     """
     n = env.robot.n
     angle, rate = state.data.qpos[n], state.data.qvel[n]
@@ -152,7 +152,7 @@ def rollout(
 ) -> dict[str, Array]:
     """Metrics of every step of every episode, (steps, episodes) each.
 
-    Steps after an episode's end are in it: see `summarise`.
+    They include the steps after an episode's end: see `summarise`.
     """
 
     def episode(key: Array) -> dict[str, Array]:
@@ -178,7 +178,7 @@ def play(
 
 
 def ends(metrics: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Steps of the first success and the first event; of none, how many there are."""
+    """Steps of the first success and the first event; the number of steps if none."""
     solved = metrics["success"] > 0
     event = np.any([metrics[e] > 0 for e in EVENTS], axis=0)
     return _first(solved), _first(event)

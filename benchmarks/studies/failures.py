@@ -24,7 +24,7 @@ from envs import spheres
 from envs.base import ArmEnv
 
 CONTROLLERS = {"rmp_vices": "RMP-VICES", "vices": "VICES"}
-"""Controllers and what the tables call them."""
+"""Controllers and their names in the tables."""
 
 Figures = dict[str, np.ndarray]
 
@@ -38,7 +38,7 @@ TRAPS = {
     "two that touch": (-0.05, 0.05),
     "two, 40 mm apart": (-0.07, 0.07),
 }
-"""How far beside the straight way the centres of two 5 cm spheres lie [m]."""
+"""Offsets of the centres of two 5 cm spheres from the straight way [m]."""
 
 TORQUES = (1.0, 0.7, 0.5, 0.4, 0.3)
 """Shares of the torque limits."""
@@ -50,25 +50,25 @@ REACHING = 300
 """Policy steps to get past the sphere (15 s)."""
 
 STANDING = 0.01
-"""A grip slower than this stands [m/s]."""
+"""A grip slower than this counts as standing [m/s]."""
 
 APPROACH, HOLD = 120, 400
-"""Policy steps to get to the block, and to push on against it (20 s)."""
+"""Policy steps to reach the block, and to push against it (20 s)."""
 
 
 class Crossing(NamedTuple):
-    """A straight way with spheres in it, and what is special about it."""
+    """A straight way with spheres in it, and the torque limits."""
 
     offset: Array
-    """Of two spheres' centres from the way, to one side, (2,) [m]."""
+    """Offsets of two spheres' centres from the way, to one side, (2,) [m]."""
     torque: Array
     """Share of the torque limits."""
 
 
 def crossing_start(env: ArmEnv, key: Array, case: Crossing) -> tuple[World, Array]:
-    """A world whose spheres are halfway to its only target, and whether it fits.
+    """A world whose spheres are halfway to its only target, and whether it is usable.
 
-    It fits if there are 24 cm to the target and 3 cm of clearance.
+    It is usable with 24 cm to the target and 3 cm of clearance.
     """
     key_reset, key_side = jax.random.split(key)
     state = env.reset(key_reset)
@@ -96,7 +96,7 @@ def crossing_start(env: ArmEnv, key: Array, case: Crossing) -> tuple[World, Arra
 
 
 def crossing_keys(env: ArmEnv, cases: Crossing, worlds: int, seed: int) -> Array:
-    """Keys of as many starts (at most `worlds`) that fit in every case."""
+    """Keys of starts, at most `worlds`, that are usable in every case."""
     keys = jax.random.split(jax.random.key(seed), DRAWS * worlds)
     fits = jax.vmap(lambda key, case: crossing_start(env, key, case)[1], (None, 0))
     fit = jax.jit(jax.vmap(lambda key: jnp.all(fits(key, cases))))(keys)
@@ -231,16 +231,16 @@ def braking(worlds: int, seed: int) -> tuple[list[Row], str]:
 
 
 class Pushing(NamedTuple):
-    """Memory of a push that goes on."""
+    """Memory of a lasting push."""
 
     expert: experts.Memory
-    """Of the expert that pushes, and comes back if it slips off."""
+    """Memory of the expert that pushes, and returns if it slips off."""
     touched: Array
     """Whether the hand has met the block."""
 
 
 def push_on(controller: str, kp_ori: np.ndarray, seed: int) -> Figures:
-    """Push a block that cannot be moved, a world for each orientation stiffness.
+    """Push an immovable block, with one world for each orientation stiffness.
 
     Returns:
         `q` (steps, worlds, n) and figures of every step, (steps, worlds) each.
@@ -275,7 +275,7 @@ def push_on(controller: str, kp_ori: np.ndarray, seed: int) -> Figures:
 
 
 def blocked(worlds: int, seed: int) -> tuple[list[Row], str]:
-    """What 20 s of pushing against a block that cannot be moved do to the arm."""
+    """Effect on the arm of pushing an immovable block for 20 s."""
     rows, lines = [], []
     worlds = max(worlds // 4, 2)
     stiff = np.repeat([50.0, 300.0], worlds)

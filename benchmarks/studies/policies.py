@@ -1,4 +1,4 @@
-"""Policies: random actions, a straight line, an adversary; and one that has learned.
+"""Policies: random actions, a straight line, an adversary, and a trained one.
 
 A policy is a pair of pure functions of one environment: `start(key) -> memory` and
 `act(memory, key, view) -> (memory, action)`, the action in [-1, 1]^12.
@@ -22,7 +22,7 @@ MOTION = 6
 
 
 class View(NamedTuple):
-    """What a policy may look at."""
+    """What a policy may use."""
 
     to_target: Array
     """From the end effector to its target, (3,) [m]."""
@@ -42,7 +42,7 @@ class Policy(NamedTuple):
 
 
 def stiffness(kp: float) -> float:
-    """The entry of an action that means a stiffness of `kp` [1/s^2]."""
+    """The entry of an action for a stiffness of `kp` [1/s^2]."""
     span = ActionRange()
     u = 2.0 * np.log(kp / span.kp_min) / np.log(span.kp_max / span.kp_min) - 1.0
     return float(u)
@@ -52,7 +52,7 @@ def smooth(correlation: float = 0.95, deviation: float = 0.7) -> Policy:
     """An Ornstein-Uhlenbeck process in every entry, clipped to the action range.
 
     Args:
-        correlation: Of one policy step with the next; 0.95 forgets in about 1 s.
+        correlation: Of one policy step with the next; 0.95 is a time constant of 1 s.
         deviation: Stationary standard deviation before clipping.
     """
     noise = deviation * np.sqrt(1.0 - correlation**2)
@@ -96,7 +96,7 @@ def hard(hold: float = 20.0, least: float = 0.8, kp: float = 150.0) -> Policy:
 
 
 def straight(kp: float = 150.0) -> Policy:
-    """Displace the set-point straight towards the target, as far as the range goes.
+    """Displace the set-point straight to the target, as far as the range allows.
 
     Args:
         kp: Stiffness in every direction. [1/s^2]
@@ -160,4 +160,4 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     "straight": straight,
     "adversarial": adversarial,
 }
-"""Those that learned nothing, with their default parameters."""
+"""The untrained ones, with their default parameters."""

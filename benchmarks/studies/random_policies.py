@@ -1,6 +1,6 @@
-"""Safety under random policies, and what it costs in reaching time.
+"""Safety under random policies, and its cost in reaching time.
 
-Random policies visit what a learning policy may visit, without learning. Run as
+Random policies visit what a learning policy may visit. Run as
 ``python -m benchmarks.random_policies --json FILE``.
 """
 
@@ -52,7 +52,7 @@ HOLDING = rmp.Yielding(least=1.0)
 STILL = rmp.Stirring(amplitude=0.0)
 """The set-point is never stirred."""
 PLAIN = {"yielding": HOLDING, "limit_yielding": HOLDING, "stirring": STILL}
-"""Nothing that the paper does not have, in the same compiled program."""
+"""Without our additions to the paper, in the same compiled program."""
 
 
 def _paper(robot: rmp.Robot, signs: str) -> rmp.RMPVICES:
@@ -62,7 +62,7 @@ def _paper(robot: rmp.Robot, signs: str) -> rmp.RMPVICES:
 
 
 def _off(robot: rmp.Robot) -> rmp.RMPVICES:
-    """No safety leaf: a barrier of no weight, which shares the compiled program."""
+    """No safety leaf: barriers with zero weight, which share the compiled program."""
     off = Barrier(mu=0.0)
     limits = JointLimitBarrier(robot.q_lower, robot.q_upper, off)
     return rmp.RMPVICES(robot, off, off, limits, **PLAIN)
@@ -78,7 +78,7 @@ class _NoCurvature(Barrier):
 
 
 class _Clipped(rmp.RMPVICES):
-    """RMP-VICES that clips each torque by itself."""
+    """RMP-VICES that clips each torque separately."""
 
     def __call__(self, q, qd, setpoint, obstacles):
         out = super().__call__(q, qd, setpoint, obstacles)
@@ -90,7 +90,7 @@ class _Clipped(rmp.RMPVICES):
 
 
 def _collision(**changes: float) -> Make:
-    """Default leaves, but these parameters of the collision leaves."""
+    """Default leaves with changed parameters of the collision leaves."""
     leaf = collision_near().replace(**changes)
     return lambda robot: rmp.RMPVICES(robot, leaf, leaf)
 
@@ -159,7 +159,7 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
         "the paper's leaves, signs as printed, RMPflow's joint limiter",
     ),
 }
-"""Controllers by name: how to make one, and what it is."""
+"""Controllers by name: how to make one, and its description."""
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -196,7 +196,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def groups(envs: int, layout: str) -> list[Group]:
-    """2/8 of the worlds for each random policy, 1/8 to reach free or among spheres."""
+    """2/8 of the worlds for each random policy, 1/8 for each reaching test."""
     share = max(envs // 8, 1)
     return [
         *(Group(policy, 2 * share, layout) for policy in RANDOM),
@@ -212,7 +212,7 @@ def poisson(count: int) -> tuple[float, float]:
 
 
 def safety_rows(name: str, policy: str, figures: Figures) -> list[Row]:
-    """Event rates and what else a random policy showed of a controller."""
+    """Event rates and other figures of a controller under a random policy."""
     steps = figures["collision"].size
     rows = []
     for event in (*EVENTS, "nonfinite"):
@@ -249,7 +249,7 @@ def safety_rows(name: str, policy: str, figures: Figures) -> list[Row]:
 
 
 def reaching_rows(name: str, scene: str, figures: Figures) -> list[Row]:
-    """How many via points were reached, and how fast."""
+    """Share of via points that were reached, and the time for each."""
     over, age = figures["over"].astype(bool), figures["age"]
     event = sum(figures[e] for e in ENDING) > 0
     # Episodes that a run's end cuts short would bias: only starts with time left count.
@@ -303,7 +303,7 @@ def measure_all(args: argparse.Namespace) -> Iterator[list[Row]]:
 
 
 def table(rows: list[Row]) -> str:
-    """The ablation as Markdown: a line for each controller."""
+    """The ablation as a Markdown table, one line per controller."""
     value = {row.key: row.value for row in rows}
 
     def cell(name: str, policies: tuple[str, ...], *keys: str, digits: int = 2) -> str:
@@ -333,7 +333,7 @@ def table(rows: list[Row]) -> str:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     settings = {k: v for k, v in vars(args).items() if k not in ("json", "docs")}

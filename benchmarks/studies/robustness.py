@@ -1,7 +1,7 @@
 """Where safety ends: random policies under noise, delay, crowds, weak motors.
 
 Each setting that is varied is an axis (`benchmarks.sweeps`); all others stay at their
-defaults. The named failures of `benchmarks.failures` are measured besides. Run as
+defaults. The named failures of `benchmarks.failures` are measured too. Run as
 ``python -m benchmarks.robustness --json FILE --plot FILE --docs docs/robustness.md``.
 """
 
@@ -192,7 +192,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     worlds, steps = (4, 320) if args.quick else (args.worlds, args.steps)

@@ -38,7 +38,7 @@ class RootSystems(NamedTuple):
     qdd: np.ndarray
     """The controller's acceleration in float64, (s, n)."""
     states: tuple[np.ndarray, ...]
-    """What they are of: q, qd (s, n), action (s, 12), centre of the sphere (s, 3)."""
+    """Their states: q, qd (s, n), action (s, 12), centre of the sphere (s, 3)."""
 
 
 def control_points(robot: rmp.Robot, q: Array) -> Array:
@@ -177,8 +177,8 @@ class RootSampler:
     def float32(self, leaf: ScalarLeaf, systems: RootSystems) -> np.ndarray:
         """The controller's accelerations with everything in float32, (s, n).
 
-        Call `jax.clear_caches` between `draw` and this: what JAX traced in one
-        precision it would find again in the other.
+        Call `jax.clear_caches` between `draw` and this. Otherwise JAX would reuse what
+        it traced in the other precision.
         """
         single = (jnp.asarray(z, jnp.float32) for z in systems.states)
         return np.asarray(self._qdd(leaf, *single))

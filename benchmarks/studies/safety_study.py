@@ -50,25 +50,25 @@ class Group(NamedTuple):
     policy: str
     """A name in `POLICIES`, or `trained`."""
     worlds: int
-    """How many."""
+    """Number of worlds."""
     layout: str | None = "close"
     """Layout of the spheres; None for no spheres."""
     limit: int = 1024
     """Policy steps after which an episode ends."""
     spheres: int | None = None
-    """How many of the scene's spheres there are; None: all."""
+    """Number of spheres; None: all of the scene."""
     speed: float | None = None
     """Their speed [m/s]; None: the environment's."""
     noise: float | None = None
-    """Error of their positions that the controller is told [m]; None likewise."""
+    """Noise of the sphere positions that the controller sees [m]; None likewise."""
     delay: float | None = None
-    """Age of those [s]; None likewise."""
+    """Delay of these positions [s]; None likewise."""
     torque: float = 1.0
     """Share of the arm's torque limits that the controller may use."""
 
 
 class World(Pytree):
-    """One environment, its policy's memory, and what is special about it."""
+    """One environment, its policy's memory, and its group's settings."""
 
     state: State
     """Environment."""
@@ -183,7 +183,7 @@ class Study:
         return World(state, jax.vmap(memory)(keys, policy), special)
 
     def _special(self) -> dict[str, Array]:
-        """What is special about each world, (worlds,) each."""
+        """The settings of each world, (worlds,) each."""
         env, asked = self.env, self.env.options
         special = {
             "spheres": lambda g: _or(g.spheres, env.scene.spheres) if g.layout else 0,
@@ -201,7 +201,7 @@ class Study:
 
 
 def parts_of(controller: Any) -> dict[str, Any]:
-    """The `PARTS` of RMP-VICES; nothing of another controller."""
+    """The `PARTS` of RMP-VICES; empty for another controller."""
     if not isinstance(controller, RMPVICES):
         return {}
     return {name: getattr(controller, name) for name in PARTS}
@@ -219,7 +219,7 @@ def _or(value: Any, default: Any) -> Any:
 
 
 def _with_spheres(state: State, count: Array) -> State:
-    """The same world, all spheres but the first `count` out of the way."""
+    """The same world with all spheres but the first `count` moved away."""
     spheres, centers = state.info["spheres"], state.data.mocap_pos
     kept = jnp.arange(len(centers)) < count
     spheres = spheres.replace(
@@ -234,7 +234,7 @@ def _with_spheres(state: State, count: Array) -> State:
 
 
 def _traced(env: ArmEnv, **values: Array) -> ArmEnv:
-    """The environment with traced options, which their own check could not read."""
+    """The environment with traced options, without their validation."""
     env, options = copy.copy(env), copy.copy(env.options)
     for name, value in values.items():
         object.__setattr__(options, name, value)
@@ -260,7 +260,7 @@ def _pick(mask: Array, new: Any, old: Any) -> Any:
 
 
 def to_target(env: ArmEnv, state: State) -> Array:
-    """From the grip to the via point it is to reach; zero in tasks without one."""
+    """Vector from the grip to its via point; zero in tasks without one."""
     if "points" not in state.info:
         return jnp.zeros(3)
     points, reached = state.info["points"], state.info["reached"]

@@ -26,7 +26,7 @@ BATCH = 2048
 SYSTEMS = 256
 
 Solver = Callable[[Array, Array, Array, Array], Array]
-"""From the rows A (r, n), b (r,) and the normal equations M, f to qdd (n,)."""
+"""Maps rows A (r, n), b (r,) and normal equations M, f to qdd (n,)."""
 
 
 def cholesky(A: Array, b: Array, M: Array, f: Array) -> Array:
@@ -114,7 +114,7 @@ def batched(solver: Solver) -> Callable[..., Array]:
 
 
 def relative_errors(x: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Norm of the error over that of the exact solution; inf where x is not finite."""
+    """Error norm relative to the exact solution; inf where x is not finite."""
     error = np.linalg.norm(x - exact, axis=1) / np.linalg.norm(exact, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
@@ -220,7 +220,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, draw, and write where asked to."""
+    """Measure, print, draw, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     count, seconds = (16, 0.05) if args.quick else (SYSTEMS, 2.0)

@@ -1,4 +1,4 @@
-"""What the robustness study varies, and how it judges what came of it."""
+"""What the robustness study varies, and how it evaluates the outcome."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from benchmarks.studies.random_policies import NEAR, REACHING_LIMIT, poisson
 from benchmarks.studies.safety_study import ENDING, Group, Study
 
 CONTROLLERS = {"rmp_vices": "RMP-VICES", "vices": "VICES"}
-"""Controllers and what the tables call them."""
+"""Controllers and their names in the tables."""
 
 RANDOM = ("smooth", "hard")
 """Random policies, in the order of the tables."""
 
 
 class Cell(NamedTuple):
-    """One setting of all that is varied; the defaults are the unvaried ones."""
+    """One value of every varied setting; the defaults vary nothing."""
 
     noise: float = 0.0
-    """Standard deviation of the sphere positions that the controller is told [m]."""
+    """Noise of the sphere positions that the controller sees [m]."""
     delay: float = 0.0
-    """Their age [s]."""
+    """Delay of these positions [s]."""
     speed: float = 0.0
     """Speed of the spheres [m/s]."""
     spheres: int = 2
-    """How many there are."""
+    """Number of spheres."""
     torque: float = 1.0
-    """Share of the torque limits that may be used."""
+    """Usable share of the torque limits."""
     layout: str = "close"
     """Layout of the spheres under the random policies."""
     sim_dt: float = 0.005
@@ -40,14 +40,14 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What is not at its default."""
+        """The settings that are not at their defaults."""
         default = Cell()._asdict()
         changed = {k: v for k, v in self._asdict().items() if v != default[k]}
         return ",".join(f"{k}={v}" for k, v in changed.items()) or "default"
 
     @property
     def program(self) -> Program:
-        """What the compiled program that runs it is made for."""
+        """Its compiled program."""
         return Program(self.sim_dt, self.armature, 8 if self.spheres != 2 else 2)
 
     def groups(self, worlds: int) -> tuple[Group, ...]:
@@ -60,23 +60,23 @@ class Cell(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Options that need a program of their own."""
+    """Options that need their own compiled program."""
 
     sim_dt: float
     """Timestep [s]."""
     armature: str
     """Rotor inertias."""
     slots: int
-    """Spheres that there is room for."""
+    """Slots for spheres."""
 
 
 class Axis(NamedTuple):
     """A setting and its values."""
 
     title: str
-    """What the first column of its table is called."""
+    """Title of the first column of its table."""
     cells: dict[str, Cell]
-    """The values by the name that they have in the table."""
+    """The values by their names in the table."""
 
 
 AXES = {
@@ -104,11 +104,11 @@ AXES = {
         "armature", {x: Cell(armature=x) for x in ("physical", "robosuite")}
     ),
 }
-"""What is varied. Without speed a delay changes nothing."""
+"""The varied settings. Without speed a delay changes nothing."""
 
 
 class Outcome(NamedTuple):
-    """What one controller did under one random policy in one cell."""
+    """Result of one controller under one random policy in one cell."""
 
     steps: int
     """Policy steps."""
@@ -127,7 +127,7 @@ class Outcome(NamedTuple):
     saturation: float
     """Share of the physics steps with a torque at its limit."""
     unplaced: float
-    """Spheres that there was no place for, mean; those left out count too."""
+    """Mean number of spheres without a place; unused slots count too."""
 
     @property
     def rate(self) -> float:
@@ -142,18 +142,18 @@ class Outcome(NamedTuple):
 
 
 class Reaching(NamedTuple):
-    """How one controller reached via points in one cell."""
+    """Via points that one controller reached in one cell."""
 
     reached: int
-    """Via points."""
+    """Reached via points."""
     missed: int
-    """Episodes that ended with one left, by an event or after 15 s."""
+    """Episodes that ended before the last one, by an event or after 15 s."""
     lost: int
-    """Those of them that an event ended."""
+    """Those that ended by an event."""
 
     @property
     def share(self) -> float:
-        """Via points that were reached, of those that were tried."""
+        """Share of the attempted via points that were reached."""
         return self.reached / max(self.reached + self.missed, 1)
 
 
@@ -193,7 +193,7 @@ def judge_reaching(figures: dict[str, np.ndarray]) -> Reaching:
 
 
 def cells_of(controller: str, axes: Sequence[str]) -> dict[Program, list[Cell]]:
-    """The cells to run, by program. VICES does not look: nothing blinds it."""
+    """The cells to run, by program. VICES ignores obstacles, so it needs fewer."""
     found: dict[Program, list[Cell]] = {}
     for cell in dict.fromkeys(c for a in axes for c in AXES[a].cells.values()):
         if controller == "rmp_vices" or not (cell.noise or cell.delay):

@@ -1,4 +1,4 @@
-"""How fine the physics and control timestep has to be, and how good the solver.
+"""How small the physics and control timestep must be, and how good the solver is.
 
 Run as ``python -m benchmarks.timestep --json FILE [--plot FILE]``. Every timestep gets
 the same starts and the same policy actions at 20 Hz, on MuJoCo's C engine; the paths
@@ -108,7 +108,7 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
             after = env.physics.step(data, out.tau)
             torques = torques.then(out.tau)
             scale = out.diagnostics["torque_scale"]
-            motion = Motion.none(after.qvel[:n])  # its jerk is not asked for
+            motion = Motion.none(after.qvel[:n])  # its jerk is not used
             now = observe(env.scene, env.robot, after, torques, motion, scale)
             jump = jnp.maximum(jump, now.torque_jump)
             force = jnp.maximum(force, now.force_peak)
@@ -138,8 +138,8 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
 def compare(name: str, mine: dict, best: dict, note: str) -> list[Row]:
     """Rows of one variant against the reference.
 
-    Paths are compared until an episode's first event in either run: beyond a collision
-    they say how chaotic an impact is, not how good the timestep.
+    Paths are compared until an episode's first event in either run. After a collision
+    they measure how chaotic an impact is, not how good the timestep is.
     """
     rows = []
     touched = mine["event"] | best["event"]
@@ -242,7 +242,7 @@ def plot(rows: list[Row], path: Path) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, print, and write where asked to."""
+    """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     size = 16 if args.quick else args.num_envs

@@ -1,11 +1,11 @@
 """Tune the default leaves on all tasks at once, against random policies.
 
-Each trial drives many arms with the smooth, hard and adversarial random policies past
-fixed and moving spheres, at the door and at the block, straight and with a trained
-policy to via points, and a scripted expert at the heavy door. Two figures are
-minimised: how many of VICES' events are left, and how much of what a user wants is
-lost: progress, targets that are reached. The sampler sees the search seeds only; the
-report runs today's defaults and the best trials on held-out seeds. Run as
+Each trial runs the smooth, hard and adversarial random policies among fixed and moving
+spheres, at the door and at the block, a straight line and a trained policy to via
+points, and a scripted expert at the heavy door. Two figures are minimised: the share of
+VICES' events that are left, and the share of progress and reached targets that is lost.
+The sampler sees the search seeds only. The report runs today's defaults and the best
+trials on held-out seeds. Run as
 ``python -m benchmarks.tune --run RUN --trials 60 --json FILE``.
 """
 
@@ -37,10 +37,10 @@ from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.loop import load_agent
 
 SEARCH_SEED, REPORT_SEED = 100, 200
-"""First of the seeds that the sampler sees, and of those that the report runs."""
+"""First seed of the search, and first seed of the report."""
 
 STALLED = 200
-"""Policy steps after which a trained policy has stalled if it is not done."""
+"""Policy steps after which an unfinished trained policy counts as stalled."""
 
 HEAVY_STARTS, HEAVY_STEPS = 16, 90
 """Starts of the expert at the heavy door, and its policy steps (it needs 60)."""
@@ -65,12 +65,12 @@ SCENES = (
     Scene("door", "door", ("smooth", "hard"), {"obstacles": 0}),
     Scene("push", "push", ("smooth", "hard"), {"obstacles": 0}),
 )
-"""What the default parameters are tuned on."""
+"""Scenes for which the default parameters are tuned."""
 
 
 @dataclasses.dataclass
 class Tally:
-    """What one controller did in one scene under one policy, or reaching."""
+    """Counts of one controller in one scene under one policy, or reaching."""
 
     steps: int = 0
     """Policy steps."""
@@ -81,7 +81,7 @@ class Tally:
     asked: float = 0.0
     """Squared length of the commanded displacements [m^2]."""
     moved: float = 0.0
-    """Way along them, times their length [m^2]."""
+    """Progress along them, times their length [m^2]."""
     jump: float = 0.0
     """Largest change of a torque in a physics step [N m]."""
 
@@ -107,7 +107,7 @@ class Bench:
     def __init__(
         self, kind: str, worlds: int, steps: int, armature: str, agent: Agent | None
     ):
-        """Build them; `worlds` of each policy run for `steps` policy steps."""
+        """Build the scenes; `worlds` of each policy run for `steps` policy steps."""
         self.studies = {}
         for scene in SCENES:
             groups = [Group(policy, worlds) for policy in scene.policies]
@@ -142,7 +142,7 @@ class Bench:
         """Tallies by scene and policy; figures of reaching.
 
         Args:
-            parameters: Those of RMP-VICES; None for VICES.
+            parameters: Parameters of RMP-VICES; None for VICES.
             seed: Of everything random.
         """
         tallies: dict[str, Tally] = {}
@@ -175,9 +175,9 @@ class Bench:
 
 
 def score(ours: dict[str, Any], vices: dict[str, Any]) -> tuple[float, float]:
-    """Events left of VICES', and progress lost of VICES', both means over the scenes.
+    """Share of VICES' events left and of its progress lost, means over the scenes.
 
-    A target that is missed among spheres, and slower reaching, count as lost progress.
+    Missed targets among spheres and slower reaching count as lost progress.
     """
     left, lost = [], []
     for name, mine in ours["tallies"].items():
@@ -261,7 +261,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Search, report, and write where asked to."""
+    """Search, report, and write the requested files."""
     args = parse(argv)
     runtime.configure()
     agent = policy_of(args.run) if args.run else None
