@@ -182,8 +182,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test: one round")
-    parser.add_argument("--rounds", type=int, default=5, help="turns that are counted")
-    parser.add_argument("--seed", type=int, default=0, help="of the random states")
+    parser.add_argument("--rounds", type=int, default=5, help="measured rounds")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random states")
     parser.add_argument(
         "--peer",
         choices=[peer.name for peer in PEERS],

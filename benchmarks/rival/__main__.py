@@ -44,9 +44,11 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test: one round")
-    parser.add_argument("--rounds", type=int, default=5, help="turns that are counted")
-    parser.add_argument("--seed", type=int, default=0, help="of the states to agree on")
-    parser.add_argument("--num_envs", type=int, default=256, help="of a training")
+    parser.add_argument("--rounds", type=int, default=5, help="measured rounds")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the states")
+    parser.add_argument(
+        "--num_envs", type=int, default=256, help="environments in training"
+    )
     return parser.parse_args(argv)
 
 

@@ -35,7 +35,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Controller speed.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few calls")
-    parser.add_argument("--seed", type=int, default=0, help="of the random states")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random states")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args(argv)
 

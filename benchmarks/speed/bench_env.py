@@ -25,7 +25,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Environment speed.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test: one size")
-    parser.add_argument("--seed", type=int, default=0, help="of states and actions")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of states and actions"
+    )
     parser.add_argument(
         "--engine",
         choices=ENGINES,
@@ -33,7 +35,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         help="measure only this physics engine; may be repeated (default: all)",
     )
     parser.add_argument("--num_envs", type=int, nargs="+", default=SIZES)
-    parser.add_argument("--seconds", type=float, default=10.0, help="for each size")
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, help="time for each size"
+    )
     return parser.parse_args(argv)
 
 

@@ -59,7 +59,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--iterations", type=int, default=40, help="to time")
+    parser.add_argument("--iterations", type=int, default=40, help="timed iterations")
     parser.add_argument("--num_devices", type=int, help="default: all")
     parser.add_argument("--first_step", type=float, help=argparse.SUPPRESS)
     return parser.parse_args(argv)

@@ -28,7 +28,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the options."""
     parser = argparse.ArgumentParser(description="Cost of sharing environments.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
-    parser.add_argument("--iterations", type=int, default=10, help="to time")
+    parser.add_argument("--iterations", type=int, default=10, help="timed iterations")
     parser.add_argument("--envs_per_device", type=int, default=64)
     parser.add_argument("--worker", type=int, nargs=2, help=argparse.SUPPRESS)
     return parser.parse_args(argv)

@@ -199,7 +199,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Train both loops with every seed, write figure and JSON; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--tasks", nargs="+", default=["reach"], help="reach, or a task"
+        "--tasks", nargs="+", default=["reach"], help="`reach` or a task"
     )
     parser.add_argument("--steps", type=int, nargs="+", default=[200_000])
     parser.add_argument("--seeds", type=int, nargs="+", default=[5])

@@ -166,14 +166,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the options."""
     parser = argparse.ArgumentParser(description="Safety under random policies.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
-    parser.add_argument("--docs", type=Path, help="renew the table of this page")
+    parser.add_argument("--docs", type=Path, help="update the table of this page")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few steps")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    parser.add_argument("--envs", type=int, default=256, help="worlds side by side")
-    parser.add_argument("--steps", type=int, default=560, help="policy steps of each")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--envs", type=int, default=256, help="number of worlds")
+    parser.add_argument("--steps", type=int, default=560, help="policy steps per world")
     parser.add_argument("--physics", choices=("mujoco", "mjx"), default="mujoco")
     parser.add_argument("--sim-dt", type=float, default=0.005, help="[s]")
-    parser.add_argument("--armature", default="physical", help="of the Jaco 2")
+    parser.add_argument("--armature", default="physical", help="rotor inertias")
     parser.add_argument(
         "--layout",
         choices=tuple(LAYOUTS),

@@ -172,10 +172,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Where safety ends.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--plot", type=Path, help="events over the axes, as a PNG")
-    parser.add_argument("--docs", type=Path, help="renew the tables of this page")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    parser.add_argument("--worlds", type=int, default=32, help="of each random policy")
-    parser.add_argument("--steps", type=int, default=560, help="policy steps of each")
+    parser.add_argument("--docs", type=Path, help="update the tables of this page")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--worlds", type=int, default=32, help="worlds per policy")
+    parser.add_argument("--steps", type=int, default=560, help="policy steps per world")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few steps")
     parser.add_argument(
         "--axis",

@@ -215,7 +215,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--quick", action="store_true", help="a smoke test: few systems"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the random states")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random states")
     return parser.parse_args(argv)
 
 

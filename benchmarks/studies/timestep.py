@@ -36,8 +36,12 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Timestep and solver convergence.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--plot", type=Path, help="draw the path errors to this file")
-    parser.add_argument("--num-envs", type=int, default=128, help="random episodes")
-    parser.add_argument("--seed", type=int, default=0, help="of starts and actions")
+    parser.add_argument(
+        "--num-envs", type=int, default=128, help="number of random episodes"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of starts and actions"
+    )
     parser.add_argument("--quick", action="store_true", help="a smoke test")
     return parser.parse_args(argv)
 

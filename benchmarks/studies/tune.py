@@ -251,12 +251,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write rows and trials to this file")
     parser.add_argument("--plot", type=Path, help="the trade-off, as a PNG")
     parser.add_argument("--trials", type=int, default=60)
-    parser.add_argument("--minutes", type=float, help="no trial begins after these")
-    parser.add_argument("--worlds", type=int, default=32, help="of each policy")
-    parser.add_argument("--steps", type=int, default=320, help="policy steps of each")
-    parser.add_argument("--report", type=int, default=4, help="held-out seeds")
+    parser.add_argument("--minutes", type=float, help="start no trial after this")
+    parser.add_argument("--worlds", type=int, default=32, help="worlds per policy")
+    parser.add_argument("--steps", type=int, default=320, help="policy steps per world")
+    parser.add_argument(
+        "--report", type=int, default=4, help="number of held-out seeds"
+    )
     parser.add_argument("--run", type=Path, help="trajectory run whose policy stalls")
-    parser.add_argument("--armature", default="physical", help="of the Jaco 2")
+    parser.add_argument("--armature", default="physical", help="rotor inertias")
     return parser.parse_args(argv)
 
 

@@ -38,7 +38,7 @@ def load_physics(name: str, model: mujoco.MjModel) -> Physics:
 
 
 def require(name: str) -> None:
-    """Check that an engine can be had, before anything long starts.
+    """Check that an engine is available, before anything long starts.
 
     Raises:
         PhysicsError: Unknown name, or a package that is not installed.

@@ -1,4 +1,4 @@
-"""The interface every physics engine stands behind."""
+"""The interface of every physics engine."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ class PhysicsError(ValueError):
 
 
 class PhysicsState(Pytree):
-    """All that must be carried from one physics step to the next."""
+    """Everything that one physics step passes on to the next."""
 
     qpos: Float[Array, " nq"]
     """Generalised positions."""
     qvel: Float[Array, " nv"]
     """Generalised velocities."""
     warmstart: Float[Array, " nv"]
-    """Last acceleration, from which the constraint solver starts."""
+    """Last acceleration; the constraint solver starts from it."""
     mocap_pos: Float[Array, "k 3"]
-    """World positions of the obstacles the scene moves (mocap bodies) [m]."""
+    """World positions of the moving obstacles (mocap bodies) [m]."""
     sensors: Float[Array, " s"]
     """Contact sensors of the last step."""
 
@@ -95,7 +95,7 @@ def add_pairs(
     friction: float = 0.0,
     watched: bool = True,
 ) -> None:
-    """Make contact explicit: of all geoms only the pairs given here collide.
+    """Make contact explicit: only the pairs given here collide.
 
     Args:
         spec: Scene to edit; call once for each kind of contact.
@@ -159,7 +159,7 @@ def pair_sensors(model: mujoco.MjModel) -> list[int]:
 
 
 def _take(x: Array, index: np.ndarray) -> Array:
-    """x[index] by slices: XLA's CPU backend reads what is gathered one by one."""
+    """x[index] by slices: XLA's CPU backend gathers one element at a time."""
     if not index.size:
         return x[:0]
     runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)

@@ -20,8 +20,8 @@ class MujocoPhysics:
     """A batch of C simulations, one thread per core, behind a host callback.
 
     Each step loads the environments' states into a batch and reads the results
-    back: the engine itself remembers nothing, so the step is a pure function. Steps
-    that run at once, those of several devices or of two programs, take a batch each.
+    back. The engine keeps no state between steps, so the step is a pure function. Steps
+    that run concurrently, on several devices or in two programs, use a batch each.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -38,8 +38,8 @@ class MujocoPhysics:
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """Advance by one timestep.
 
-        A simulation that the engine would reset or stop because its state is bad comes
-        back as NaN: it must not look safe.
+        If the engine would reset or stop a simulation because of a bad state, the result
+        is NaN, so that it cannot look safe.
         """
         given = (state.qpos, state.qvel, state.warmstart, state.mocap_pos, ctrl)
         good = jnp.all(
@@ -84,7 +84,7 @@ class _Batch:
         self.time = bind("time")
 
     def step(self, out, given) -> None:
-        """Advance from the arrays given; write into those for the results."""
+        """Advance from the given arrays and write into the result arrays."""
         for ours, theirs in zip(self.given, given, strict=True):
             ours[...] = theirs.reshape(ours.shape)
         self.time[...] = 1.0
@@ -98,7 +98,7 @@ class _Batch:
 
 
 def _in_place(step, shapes, *given):
-    """Call the host where it reads and writes the program's own memory."""
+    """Call the host, which reads and writes the program's own memory."""
 
     def call(_, out, *given):
         step([np.asarray(x) for x in out], [np.asarray(x) for x in given])

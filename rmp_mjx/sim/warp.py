@@ -21,10 +21,10 @@ from rmp_mjx.sim.base import PhysicsError, PhysicsState, init_state
 class WarpPhysics:
     """Steps all worlds of a batch in one call, however deeply it is vmapped.
 
-    Warp keeps the contacts of all worlds in one list, whose length must be known before
-    the number of worlds is: the batch is made when that is known, with room for every
-    contact that the scene's pairs can have, so none is lost. Sensors are its own.
-    It computes in single precision and runs on a CPU too, where it is slow.
+    Warp keeps the contacts of all worlds in one list of fixed length. The batch is made
+    once the number of worlds is known, with room for every contact that the scene's
+    pairs can have, so none is lost. Sensors are Warp's own. It computes in single
+    precision. It also runs on a CPU, slowly.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -100,7 +100,7 @@ class WarpPhysics:
 
 
 def _quiet(model: mjx.Model) -> mjx.Model:
-    """Do not print where the solver uses all iterations it has, as no engine does."""
+    """Do not print if the solver uses all of its iterations; no other engine does."""
     from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
     told = model.opt._impl.warn_overflow
@@ -120,7 +120,7 @@ def capacity(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def _flattened(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of arrays with a leading axis, into which each `vmap` goes."""
+    """A function of arrays with one leading axis, into which every `vmap` is merged."""
     batched = jax.custom_batching.custom_vmap(function)
 
     @batched.def_vmap
