@@ -38,8 +38,8 @@ class MujocoPhysics:
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """Advance by one timestep.
 
-        If the engine would reset or stop a simulation because of a bad state, the result
-        is NaN, so that it cannot look safe.
+        A simulation that the engine would reset or stop because of a bad state gives
+        NaN, so that it cannot look safe.
         """
         given = (state.qpos, state.qvel, state.warmstart, state.mocap_pos, ctrl)
         good = jnp.all(
