@@ -1,7 +1,7 @@
 """Tasks as Gymnasium environments: one (`TaskEnv`) or many at once (`TaskVector`).
 
-Needs the extra `gym`. Rewards, ends and observations are the task's own; the time limit
-is a truncation. What a trainer does not look at is in `info`: the task's metrics.
+Needs the extra `gym`. Rewards, terminations and observations are those of the task. The
+time limit is a truncation. `info` has the task's metrics.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from envs.types import State
 from rmp_mjx.trees import cast_like, select
 
 LARGEST_SEED = 2**31
-"""Seeds of starts are drawn below this."""
+"""Upper bound of the drawn seeds."""
 
 
 def observation_space(task: ArmEnv) -> spaces.Box:
@@ -45,7 +45,7 @@ def _draw(random: np.random.Generator) -> int:
 
 
 def _strong(tree: Any) -> Any:
-    """Leaves with types of their own: otherwise a step is compiled twice."""
+    """Leaves with strong types: otherwise a step is compiled twice."""
     return cast_like(tree, tree)
 
 
@@ -93,14 +93,14 @@ class TaskEnv(gymnasium.Env):
 
 
 class _Lanes(NamedTuple):
-    """Where the environments of a vector stand."""
+    """The states of a vector of environments."""
 
     state: State
     """Their states, batched."""
     age: Int[Array, " b"]
     """Policy steps since their starts."""
     keys: Key[Array, " b"]
-    """Where their next starts come from."""
+    """Keys of their next starts."""
 
 
 class TaskVector(VectorEnv):
@@ -168,8 +168,8 @@ class TaskVector(VectorEnv):
         """Start an episode everywhere.
 
         Args:
-            seed: Environment k gets seed + k, or the k-th of a list, and then starts
-                as a `TaskEnv` with that seed does.
+            seed: Environment k gets seed + k, or the k-th of a list. It then starts
+                like a `TaskEnv` with that seed.
             options: Not used.
 
         Raises:
@@ -215,6 +215,6 @@ class TaskVector(VectorEnv):
 
 
 def _masked(metrics: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
-    """Metrics as Gymnasium's vectors hand on info: values, and whose they are."""
+    """Metrics as Gymnasium's vectors return info: values and a mask."""
     values = {name: np.where(mask, x, 0.0) for name, x in metrics.items()}
     return values | {f"_{name}": mask for name in metrics}

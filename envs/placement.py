@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from rmp_mjx.types import Constant
 
 CANDIDATES = 64
-"""Placements drawn at once; the first that satisfies the rules is taken."""
+"""Placements drawn at once; the first valid one is used."""
 
 LAYOUTS = {
     "far": {"points": ("surface", 0.08), "arm": 0.08},

@@ -16,7 +16,7 @@ SIZE = (480, 640)
 """Height and width of a frame [pixels]."""
 
 SHADOW_PIXELS = 1024
-"""Side of the shadow map: four times that costs three times a frame's time."""
+"""Side of the shadow map. Four times as large, a frame takes three times as long."""
 
 FRONT = {"lookat": (0.25, 0.0, 0.2), "distance": 1.4, "azimuth": 143, "elevation": -22}
 """The usual view: from beyond the workspace, at the arm's right [m, degrees]."""
@@ -51,7 +51,7 @@ def render(
         env: The environment that made them.
         states: States of one environment (not batched).
         size: Height and width [pixels].
-        shadows: Whether things throw shadows, which takes half of the time.
+        shadows: Whether to draw shadows, which takes half of the time.
 
     Returns:
         Frames (height, width, 3), uint8.
@@ -79,7 +79,7 @@ def render(
 
 
 def _draw_marks(scene: mujoco.MjvScene, info: dict) -> None:
-    """Add what the policy must reach: via points as balls, a goal as a disc."""
+    """Add the goals of the policy: via points as balls, a goal as a disc."""
     if "points" in info:
         reached = int(info["reached"])
         for k, point in enumerate(np.asarray(info["points"], float)):

@@ -28,7 +28,7 @@ class Contacts(Pytree):
     fixtures: tuple[str, ...] = struct.field(pytree_node=False, default=())
     """Geoms that no part of the arm may touch."""
     work: tuple[str, ...] = struct.field(pytree_node=False, default=())
-    """Geoms that the hand works with, and nothing else of the arm may touch."""
+    """Geoms that the hand may touch, and no other part of the arm."""
     work_friction: float = struct.field(pytree_node=False, default=0.5)
     """Sliding friction of the hand on them."""
     passive: tuple[tuple[str, str, float], ...] = struct.field(
@@ -38,20 +38,20 @@ class Contacts(Pytree):
 
 
 class Scene(Pytree):
-    """A compiled scene and what its watched contact pairs mean (all static)."""
+    """A compiled scene and the meaning of its watched contact pairs (all static)."""
 
     model: mujoco.MjModel = struct.field(pytree_node=False)
     """The scene; the arm's joints come first."""
     hand: np.ndarray = struct.field(pytree_node=False)
-    """Pairs of the hand with what it must not touch, (pairs,) bool."""
+    """Pairs of the hand with geoms that it must not touch, (pairs,) bool."""
     arm: np.ndarray = struct.field(pytree_node=False)
-    """Pairs of any other link with anything but the arm."""
+    """Pairs of any other link with geoms outside the arm."""
     obstacle: np.ndarray = struct.field(pytree_node=False)
-    """Those of the hand's and the arm's pairs that are with a sphere."""
+    """Pairs of hand or arm with a sphere."""
     own: np.ndarray = struct.field(pytree_node=False)
     """Pairs of two links of the arm."""
     work: np.ndarray = struct.field(pytree_node=False)
-    """Pairs of the hand with what it works on."""
+    """Pairs of the hand with geoms that it may touch."""
     spheres: int = struct.field(pytree_node=False)
     """Obstacle spheres (mocap bodies, in order)."""
 
@@ -73,9 +73,9 @@ def build_scene(
     """Compile the arm on its table with the task's objects and obstacle spheres.
 
     Contact is explicit: the table with every link that can reach it; fixtures, objects
-    and spheres with every moving link; and the links that can touch each other. Contact
-    that is not meant to happen is frictionless: its normal force is what the safety
-    record reads.
+    and spheres with every moving link; and the links that can touch each other.
+    Contacts that should not happen are frictionless, because the safety record reads
+    their normal forces only.
 
     Args:
         robot: The arm.
@@ -83,7 +83,7 @@ def build_scene(
         spheres: Number of obstacle spheres.
         sphere_radius: Their radius [m].
         cone: Friction cone, `pyramidal` or `elliptic`.
-        objects: Adds the task's objects and says which geoms matter.
+        objects: Adds the task's objects and returns which geoms take part in contact.
     """
     spec = mujoco.MjSpec.from_file(str(ASSETS / "arena.xml"))
     spec.option.timestep = sim_dt

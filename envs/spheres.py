@@ -1,4 +1,4 @@
-"""The obstacle spheres of an episode: where they are, and what is known of them."""
+"""The obstacle spheres of an episode: their motion, and how the controller sees them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rmp_mjx.pytree import Pytree
 from rmp_mjx.types import Constant
 
 AWAY = (0.0, 0.0, -5.0)
-"""Where a sphere waits that found no place [m]."""
+"""Position of a sphere that found no place [m]."""
 
 
 class Spheres(Pytree):
-    """What the physics does not carry of the spheres."""
+    """State of the spheres besides their positions."""
 
     placed: Bool[Array, " k"]
     """Which of them found a place."""
@@ -54,15 +54,15 @@ class Spheres(Pytree):
         error: Float[Array, "k 3"] | float,
         delay: float,
     ) -> Obstacles:
-        """Fill the sphere slots with what the controller is told.
+        """Fill the sphere slots with what the controller sees.
 
         Args:
             slots: Obstacles with k sphere slots.
             centers: True centres, (k, 3) [m].
             radius: Radius [m].
             error: Error of the measured positions, (k, 3) [m].
-            delay: Age of the measurement [s]: a sphere is seen where it was then, at
-                its present velocity.
+            delay: Age of the measurement [s]. A sphere is seen at its old position,
+                with its present velocity.
         """
         seen = centers - delay * self.velocity + error
         radii = jnp.full(self.placed.shape, radius)
