@@ -1,4 +1,4 @@
-"""The obstacle spheres of an episode: their motion, and how the controller sees them."""
+"""The obstacle spheres of an episode: their motion, and what the controller sees."""
 
 from __future__ import annotations
 
