@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import mujoco
 
 from rmp_mjx.names import unknown
 from rmp_mjx.robot.errors import RobotError
+from rmp_mjx.robot.numbers import Numbers, vector
 
 
 def end_effector(
     spec: mujoco.MjSpec,
     site: str | None,
     body: str | None,
-    offset: Sequence[float],
+    offset: Numbers,
 ) -> str:
     """The end-effector site's name; the site is added where a body is named instead.
 
@@ -35,10 +35,9 @@ def end_effector(
             "name the end effector, by site= or by body= (one of them); "
             f"sites: {', '.join(sites) or 'none'}; bodies: {', '.join(bodies)}"
         )
-    if len(offset) != 3:
-        raise RobotError(f"offset must be 3 numbers [m], got {list(offset)}")
+    position = vector("offset", offset, 3)
     if site is not None:
-        if any(offset):
+        if position.any():
             raise RobotError("offset= goes with body=: a site has a place of its own")
         if not sites:
             raise RobotError(
@@ -57,7 +56,7 @@ def end_effector(
         ["end_effector"], (f"end_effector_{k}" for k in itertools.count(1))
     )
     name = next(name for name in names if name not in sites)
-    spec.body(body).add_site(name=name, pos=list(offset), quat=[1.0, 0.0, 0.0, 0.0])
+    spec.body(body).add_site(name=name, pos=position, quat=[1.0, 0.0, 0.0, 0.0])
     return name
 
 

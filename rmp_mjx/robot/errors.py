@@ -15,6 +15,7 @@ class RobotWarning(UserWarning):
 def warn(message: str) -> None:
     """Issue a `RobotWarning` that points at the line outside this package."""
     level, frame = 1, sys._getframe()
-    while frame is not None and frame.f_globals["__name__"].startswith("rmp_mjx."):
+    inside = ("rmp_mjx.", "jaxtyping.")  # jaxtyping may wrap what it checks
+    while frame is not None and frame.f_globals["__name__"].startswith(inside):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RobotWarning, stacklevel=level)

@@ -150,7 +150,7 @@ def joint_metric(S: Motion, F: Motion) -> Float[Array, "n n"]:
     """
 
     def outer(a: Vec, b: Vec) -> Array:
-        return a.map(lambda c: c[:, None]) @ b
+        return a.map(lambda c: c[:, None]) @ b.map(lambda c: c[None])
 
     G = outer(S.lin, F.lin) + outer(S.ang, F.ang)
     upper = np.triu(np.ones(G.shape, bool))
@@ -244,7 +244,7 @@ def _carry(
     """`carry_points` from the joint frames."""
     offset = jnp.asarray(offset, p.dtype)
     carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
-    axes = jnp.concatenate([offset.T[:, None] * carrier, carrier[None]])
+    axes = jnp.concatenate([offset.T[:, None] * carrier[None], carrier[None]])
     frames = jnp.concatenate([R, p[:, None]], axis=1)
     x = _dot(frames.reshape(3, -1), axes.reshape(-1, len(segment)))
     if (segment < 0).any():

@@ -19,10 +19,7 @@ def read_spec(path: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
     Every body, joint and geom gets a name, and asset folders become absolute, so that
     the arm's text finds its meshes from anywhere.
     """
-    if isinstance(path, mujoco.MjSpec):
-        spec = path.copy()
-    else:
-        spec = _parse(str(path))
+    spec = _parse(str(path)) if isinstance(path, (str, Path)) else path.copy()
     _make_assets_absolute(spec)
     for kind in ("body", "joint", "geom"):
         parts = {"body": spec.bodies, "joint": spec.joints, "geom": spec.geoms}[kind]
@@ -66,9 +63,9 @@ def model_name(spec: mujoco.MjSpec, path: str | Path | mujoco.MjSpec) -> str:
     """The model's name; without one the file's, or `arm`."""
     if spec.modelname != "MuJoCo Model":  # what MuJoCo calls a model without a name
         return spec.modelname
-    if isinstance(path, mujoco.MjSpec) or str(path).lstrip().startswith("<"):
-        return "arm"
-    return Path(path).stem
+    if isinstance(path, (str, Path)) and not str(path).lstrip().startswith("<"):
+        return Path(path).stem
+    return "arm"
 
 
 def lock_other_joints(

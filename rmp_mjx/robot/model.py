@@ -35,6 +35,7 @@ from rmp_mjx.robot.mjcf import (
     remove_gravity_compensation,
 )
 from rmp_mjx.robot.motors import make_motors
+from rmp_mjx.robot.numbers import Numbers, vector
 from rmp_mjx.robot.passive import PassiveForces, passive_forces
 from rmp_mjx.robot.posture import nominal_posture
 from rmp_mjx.types import Constant
@@ -187,10 +188,10 @@ class Robot(Pytree):
         links: Sequence[str] | None = None,
         *,
         body: str | None = None,
-        offset: Sequence[float] = (0.0, 0.0, 0.0),
-        armature: Sequence[float] | None = None,
-        torque_limits: Sequence[float] | None = None,
-        q_home: Sequence[float] | None = None,
+        offset: Numbers = (0.0, 0.0, 0.0),
+        armature: Numbers | None = None,
+        torque_limits: Numbers | None = None,
+        q_home: Numbers | None = None,
         compensate_passive: bool = True,
         spacing: float = SPACING,
     ) -> Robot:
@@ -232,11 +233,8 @@ class Robot(Pytree):
         remove_gravity_compensation(spec)
         make_motors(spec, compile_spec(spec), joints, torque_limits)
         if armature is not None:
-            if len(armature) != len(joints):
-                raise RobotError(
-                    f"armature has {len(armature)} entries for {len(joints)} joints"
-                )
-            for name, value in zip(joints, armature, strict=True):
+            rotors = vector("armature", armature, len(joints))
+            for name, value in zip(joints, rotors, strict=True):
                 spec.joint(name).armature = value
         model, mjcf, assets = compile_text(spec)
         data = mujoco.MjData(model)

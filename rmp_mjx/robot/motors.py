@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from rmp_mjx.robot.errors import RobotError, warn
+from rmp_mjx.robot.numbers import Numbers, vector
 
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
@@ -21,7 +22,7 @@ def make_motors(
     spec: mujoco.MjSpec,
     model: mujoco.MjModel,
     joints: Sequence[str],
-    given: Sequence[float] | None,
+    given: Numbers | None,
 ) -> None:
     """Replace the chain's actuators by motors, in the order of the joints.
 
@@ -40,12 +41,6 @@ def make_motors(
         RobotError: A limit is missing or not positive, or a joint has no actuator or
             several.
     """
-    if given is not None and (
-        len(given) != len(joints) or not all(np.isfinite(x) and x > 0 for x in given)
-    ):
-        raise RobotError(
-            f"torque_limits must be {len(joints)} positive numbers, got {list(given)}"
-        )
     groups = [[a for a in spec.actuators if drives(a, name)] for name in joints]
     if given is None:
         limits = [
@@ -53,7 +48,9 @@ def make_motors(
             for name, group in zip(joints, groups, strict=True)
         ]
     else:
-        limits = [float(limit) for limit in given]
+        limits = vector("torque_limits", given, len(joints)).tolist()
+        if min(limits) <= 0:
+            raise RobotError(f"torque_limits must be positive, got {limits}")
         for name in joints:  # else the simulation would still apply the file's
             if model.jnt_actfrclimited[model.joint(name).id]:
                 spec.joint(name).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -91,14 +88,14 @@ def _is_motor(
 ) -> bool:
     """Whether control is torque, within exactly the limit."""
     a = actuator.id
-    return (
+    return bool(
         _kind(model, a) == "motor"
         and model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
         and model.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
         and model.actuator_gainprm[a, 0] == 1.0
         and model.actuator_gear[a, 0] == 1.0
-        and bool(model.actuator_ctrllimited[a])
-        and bool(np.all(model.actuator_ctrlrange[a] == [-limit, limit]))
+        and model.actuator_ctrllimited[a]
+        and np.all(model.actuator_ctrlrange[a] == [-limit, limit])
         and not (actuator.armature or np.any(actuator.damping) or actuator.nsample)
     )
 

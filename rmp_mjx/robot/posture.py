@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rmp_mjx.robot.errors import RobotError, warn
+from rmp_mjx.robot.numbers import Numbers, vector
 
 CLOSE = 0.1
 """Part of a joint's range, at either end, that a chosen posture keeps out of."""
@@ -21,7 +22,7 @@ def nominal_posture(
     upper: np.ndarray,
     q_ref: np.ndarray,
     home: dict[str, float] | None,
-    given: Sequence[float] | None,
+    given: Numbers | None,
 ) -> np.ndarray:
     """Joint coordinates of the posture that the arm prefers and tasks start at.
 
@@ -44,11 +45,7 @@ def nominal_posture(
         RobotError: The posture given or the keyframe is not within the ranges.
     """
     if given is not None:
-        q = np.asarray(given, float)
-        if q.shape != (len(joints),) or not np.all(np.isfinite(q)):
-            raise RobotError(
-                f"q_home must be {len(joints)} finite numbers, got {list(given)}"
-            )
+        q = vector("q_home", given, len(joints))
         _check("q_home", joints, q, lower, upper)
         return q
     if home is not None:
@@ -62,7 +59,7 @@ def nominal_posture(
     if bad.any():
         names = ", ".join(
             f"'{joints[j]}' ({q_ref[j]:g}, range [{low[j]:g}, {high[j]:g}])"
-            for j in np.flatnonzero(bad)
+            for j in map(int, np.flatnonzero(bad))
         )
         warn(
             "there is no keyframe 'home', and the reference pose is outside or near "
@@ -80,7 +77,7 @@ def _check(
     upper: np.ndarray,
 ) -> None:
     slack = _ROUNDING * np.maximum(1.0, np.abs(q))
-    for j in np.flatnonzero((q < lower - slack) | (q > upper + slack)):
+    for j in map(int, np.flatnonzero((q < lower - slack) | (q > upper + slack))):
         raise RobotError(
             f"{what} puts joint '{joints[j]}' at {q[j]:g}, outside its range "
             f"[{lower[j]:g}, {upper[j]:g}]: pass q_home= with a posture within the "

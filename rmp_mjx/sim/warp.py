@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 from collections.abc import Callable
 from typing import Any
@@ -39,8 +40,7 @@ class WarpPhysics:
                 "physics 'warp' runs on an NVIDIA GPU or a CPU, and JAX's backend is "
                 f"'{jax.default_backend()}': choose physics 'mjx'"
             )
-        import warp
-
+        warp = importlib.import_module("warp")
         warp.config.log_level = warp.LOG_WARNING  # else it announces every kernel
         self.model = model
         self._contacts, self._rows = capacity(model)

@@ -50,7 +50,7 @@ def test_no_gap_between_neighbours_is_wider_than_the_spacing(robot):
         start, end = robot.capsules.start[c], robot.capsules.end[c]
         offsets = robot.points.offset[np.array(robot.points.segment) == k]
         along = end - start
-        length = np.linalg.norm(along)
+        length = float(np.linalg.norm(along))
         if length < 1e-9:
             continue
         s = (offsets - start) @ along / length

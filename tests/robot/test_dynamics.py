@@ -46,8 +46,7 @@ def test_all_terms_equal_mujoco(robot, states, terms):
 
 def test_all_terms_equal_pinocchio(robot, states, terms, tmp_path):
     """A second engine that shares no code with MuJoCo but the MJCF."""
-    import pinocchio as pin
-
+    pin = pytest.importorskip("pinocchio")
     path = tmp_path / "arm.xml"
     path.write_text(robot.mjcf)
     expected = oracles.pinocchio_terms(pin, str(path), robot.site_name, *states)

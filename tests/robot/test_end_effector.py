@@ -84,7 +84,7 @@ REFUSED = {
     "offset of the wrong length": (
         "",
         {"body": "hand", "offset": [0.1]},
-        "offset must be 3 numbers [m], got [0.1]",
+        "offset must be 3 finite numbers, got [0.1]",
     ),
     "the world": (
         "",

@@ -68,15 +68,15 @@ REFUSALS = {
     ),
     "armature of the wrong length": (
         lambda: Robot.from_mjcf(_arm(), site="tip", armature=[1.0, 2.0]),
-        "armature has 2 entries for 1 joints",
+        "armature must be 1 finite numbers, got [1.0, 2.0]",
     ),
     "torque limits of the wrong length": (
         lambda: Robot.from_mjcf(_arm(), site="tip", torque_limits=[1.0, 2.0]),
-        "torque_limits must be 1 positive numbers",
+        "torque_limits must be 1 finite numbers, got [1.0, 2.0]",
     ),
     "torque limit of zero": (
         lambda: Robot.from_mjcf(_arm(), site="tip", torque_limits=[0.0]),
-        "torque_limits must be 1 positive numbers",
+        "torque_limits must be positive, got [0.0]",
     ),
     "missing file": (
         lambda: Robot.from_mjcf("nowhere/arm.xml", site="tip"),

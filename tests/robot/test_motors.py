@@ -1,12 +1,9 @@
 """Whatever actuators a file has, the robot's own model has one torque motor a joint."""
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-import envs
 from rmp_mjx import Robot, RobotError, RobotWarning
 
 ARM = """<mujoco><compiler angle="radian"/><option gravity="0 0 0"/>
@@ -122,7 +119,7 @@ def test_rotor_inertia_and_damping_of_an_actuator_pass_to_its_joint():
     )
     robot = arm(text, joint='armature=".1" damping="1"')
     np.testing.assert_allclose(robot.armature, [0.0, 0.1 + 4 * 0.5])
-    np.testing.assert_allclose(robot.damping, [0.0, 1.0 + 4 * 0.25])
+    np.testing.assert_allclose(np.asarray(robot.damping), [0.0, 1.0 + 4 * 0.25])
     original = mujoco.MjModel.from_xml_string(
         ARM.format(actuators=FIRST + text, joint='armature=".1" damping="1"')
     )
@@ -132,7 +129,8 @@ def test_rotor_inertia_and_damping_of_an_actuator_pass_to_its_joint():
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, Mq)
         inertia.append(Mq)
-    np.testing.assert_allclose(*inertia, rtol=1e-5)  # the text has six digits
+    # The arm's text has six digits.
+    np.testing.assert_allclose(inertia[1], inertia[0], rtol=1e-5)
 
 
 def test_a_motor_with_dynamics_loses_them_with_a_warning():
@@ -171,39 +169,3 @@ REFUSED = {
 def test_a_refusal_says_which_actuator_and_what_it_needs(text, message):
     with pytest.raises(RobotError, match=message):
         arm(text)
-
-
-@pytest.fixture(scope="module")
-def servos(robot):
-    """The Jaco 2 with position actuators, limits only in their force ranges."""
-    text = robot.mjcf
-    for k, limit in enumerate(robot.tau_max, 1):
-        size = "large" if limit > 10 else "small"
-        motor = f'<general name="joint_{k}" class="{size}" joint="joint_{k}"/>'
-        assert motor in text
-        text = text.replace(
-            motor,
-            f'<position name="joint_{k}" joint="joint_{k}" kp="200" kv="20" '
-            f'forcerange="-{limit} {limit}"/>',
-        )
-    # Without the ranges of the classes, which are torques.
-    text = text.replace('<general ctrlrange="-30.5 30.5"/>', "")
-    text = text.replace('<general ctrlrange="-6.8 6.8"/>', "")
-    return Robot.from_mjcf(
-        text, site="grip", q_home=robot.q_home, compensate_passive=False
-    )
-
-
-def test_an_arm_with_position_actuators_is_the_arm_with_motors(robot, servos):
-    """The same to the last bit, but for its text."""
-    assert servos.replace(mjcf=robot.mjcf) == robot
-
-
-def test_a_position_actuated_arm_holds_still_in_a_task(servos):
-    """One second of the zero action; torques taken for positions gave 1.3 rad."""
-    env = envs.load("trajectory", robot=servos, physics="mujoco", start_noise=0.0)
-    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
-    start = state.data.qpos
-    for _ in range(20):
-        state = step(state, jnp.zeros(env.action_size))
-    np.testing.assert_allclose(state.data.qpos, start, rtol=0.0, atol=1e-3)

@@ -129,10 +129,10 @@ def test_a_bad_lane_comes_back_as_nan_and_alone(engine, step, jaco, field, value
         bad = step(state.replace(**{field: spoilt}), torque)
     for name in ("qpos", "qvel", "warmstart", "sensors"):
         assert np.all(np.isnan(getattr(bad, name)[1])), name
-        others = [
+        rest, others = (
             np.delete(np.asarray(getattr(s, name)), 1, axis=0) for s in (good, bad)
-        ]
-        np.testing.assert_array_equal(*others)
+        )
+        np.testing.assert_array_equal(rest, others)
 
 
 def test_an_obstacle_at_no_place_is_a_bad_lane(engine, step, jaco):
