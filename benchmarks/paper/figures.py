@@ -1,4 +1,4 @@
-"""Figures from the store, each as SVG and PNG."""
+"""Figures from the store."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from benchmarks.paper import measures, pictures, targets
 from benchmarks.paper.cells import PAPER, TASKS, VARIANTS, Cell
 from benchmarks.paper.columns import COLUMNS, TABLE
 from benchmarks.paper.store import Store
+from benchmarks.png import save_figure
 
 PANELS = {
     "episode/return": "return per episode",
@@ -23,6 +24,8 @@ PANELS = {
     "episode/joint_limit": "joint-limit events per episode",
 }
 """Rows of the training figure."""
+COUNTS = ("episode/collision", "episode/joint_limit")
+"""Those that cannot be negative."""
 FORCES = np.geomspace(0.1, 1e4, 26)
 """Bins of a force histogram, five a decade [N]."""
 
@@ -31,14 +34,11 @@ FORCES = np.geomspace(0.1, 1e4, 26)
 def _figure(
     path: Path, lines: int, columns: int, size: tuple[float, float]
 ) -> Iterator[tuple[Figure, np.ndarray]]:
-    """Axes (lines, columns) of a figure that is written as SVG and PNG."""
+    """Axes (lines, columns) of a figure that is written as PNG."""
     figure = Figure(figsize=(size[0] * columns, size[1] * lines), layout="constrained")
     FigureCanvasAgg(figure)
     yield figure, figure.subplots(lines, columns, squeeze=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path.with_suffix(".png"), dpi=120)
-    with mpl.rc_context({"svg.hashsalt": path.stem}):  # the same file every time
-        figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
+    save_figure(figure, path)
 
 
 def training(place: Store, path: Path, variants: Sequence[str] = PAPER) -> None:
@@ -50,7 +50,8 @@ def training(place: Store, path: Path, variants: Sequence[str] = PAPER) -> None:
                 for variant in variants:
                     rows = measures.of(place.training, task=task, variant=variant)
                     if not rows.is_empty():
-                        _curve(axis, measures.curves(rows, name), variant)
+                        curves = measures.curves(rows, name)
+                        _curve(axis, curves, variant, name in COUNTS)
                 if line == 0:
                     axis.set_title(title, fontsize=10)
                 if column == 0:
@@ -61,11 +62,12 @@ def training(place: Store, path: Path, variants: Sequence[str] = PAPER) -> None:
         _legend(axes[0, 0])
 
 
-def _curve(axis, curves: measures.Curves, variant: str) -> None:
+def _curve(axis, curves: measures.Curves, variant: str, count: bool) -> None:
     mean, (low, high) = measures.band(curves.values)
+    low = np.maximum(low, 0.0) if count else low
     x, style = curves.steps / 1e3, VARIANTS[variant]
-    count = len(curves.seeds)
-    label = f"{style.label}, {count} seed{'s' if count > 1 else ''}"
+    seeds = len(curves.seeds)
+    label = f"{style.label}, {seeds} seed{'s' if seeds > 1 else ''}"
     axis.plot(x, mean, color=style.color, lw=1.3, label=label)
     axis.fill_between(x, low, high, color=style.color, alpha=0.2, lw=0)
 
@@ -189,10 +191,13 @@ def best_cell(place: Store, task: str, variant: str) -> Cell | None:
 
 
 def montage(images: Sequence[tuple[str, Path]], path: Path, columns: int) -> bool:
-    """Pictures with their titles in a grid; False where there are none."""
+    """Pictures with their titles in a grid; True where there is one.
+
+    A packed store has no pictures: then a figure that was drawn before is kept.
+    """
     found = [(title, image) for title, image in images if image.exists()]
     if not found:
-        return False
+        return path.exists()
     sizes = [mpl.image.imread(image) for _, image in found]
     height, width = sizes[0].shape[:2]
     cell = (12.0 / columns, 12.0 / columns * height / width + 0.25)

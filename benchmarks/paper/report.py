@@ -1,4 +1,4 @@
-"""The pages of results, from the store alone."""
+"""The page of results, from the store alone."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ FIGURES = "figures"
 TITLE = "The paper's experiments, measured"
 
 
-def write(place: Store, preset: Preset, folder: Path) -> tuple[Path, Path]:
-    """Draw the figures and write both pages.
+def write(place: Store, preset: Preset, folder: Path) -> Path:
+    """Draw the figures and write the page.
 
     Args:
         place: What was measured.
         preset: The experiment.
-        folder: Where `index.md`, `index.html` and the figures go.
+        folder: Where `index.md` and the figures go.
 
     Returns:
-        The Markdown and the HTML page.
+        The page.
 
     Raises:
         ValueError: The store holds no finished training.
@@ -46,9 +46,8 @@ def write(place: Store, preset: Preset, folder: Path) -> tuple[Path, Path]:
         *_pictures(place, folder),
         *_protocol(place, preset),
     ]
-    written = folder / "index.md", folder / "index.html"
-    write_text(written[0], page.markdown(blocks))
-    write_text(written[1], page.page(blocks, TITLE, folder))
+    written = folder / "index.md"
+    write_text(written, page.markdown(blocks))
     return written
 
 
@@ -109,7 +108,7 @@ def _reproduction(place: Store) -> list[Block]:
 
 
 def _training(place: Store, folder: Path) -> list[Block]:
-    figures.training(place, folder / FIGURES / "training")
+    figures.training(place, folder / FIGURES / "training.png")
     blocks: list[Block] = [
         Heading("Training"),
         Picture(
@@ -133,7 +132,7 @@ def _training(place: Store, folder: Path) -> list[Block]:
     others = sorted(set(place.training["variant"].unique()) - set(PAPER))
     if others:
         figures.training(
-            place, folder / FIGURES / "training_baselines", tuple(VARIANTS)
+            place, folder / FIGURES / "training_baselines.png", tuple(VARIANTS)
         )
         names = ", ".join(VARIANTS[name].label for name in others)
         blocks.append(
@@ -146,7 +145,7 @@ def _training(place: Store, folder: Path) -> list[Block]:
 
 
 def _deployment(place: Store, folder: Path) -> list[Block]:
-    figures.forces(place, folder / FIGURES / "forces", PICTURED)
+    figures.forces(place, folder / FIGURES / "forces.png", PICTURED)
     blocks: list[Block] = [
         Heading("Deployment among unseen spheres"),
         Text(
@@ -178,8 +177,8 @@ def _deployment(place: Store, folder: Path) -> list[Block]:
 
 
 def _beyond(place: Store, preset: Preset, folder: Path) -> list[Block]:
-    figures.pareto(place, folder / FIGURES / "pareto")
-    figures.robustness(place, folder / FIGURES / "robustness", preset.columns)
+    figures.pareto(place, folder / FIGURES / "pareto.png")
+    figures.robustness(place, folder / FIGURES / "robustness.png", preset.columns)
     return [
         Heading("Performance against safety"),
         Picture(
@@ -227,7 +226,7 @@ def _failures(place: Store, folder: Path) -> list[Block]:
     ]
     if not events.is_empty():
         blocks.append(tables.events(events))
-    if figures.failures(place, folder / FIGURES / "failures", events):
+    if figures.failures(place, folder / FIGURES / "failures.png", events):
         caption = "How episodes ended with RMP-VICES."
         blocks.append(Picture(Path(FIGURES, "failures.png"), caption))
     return blocks
@@ -235,10 +234,10 @@ def _failures(place: Store, folder: Path) -> list[Block]:
 
 def _pictures(place: Store, folder: Path) -> list[Block]:
     blocks: list[Block] = []
-    if figures.instances(place, folder / FIGURES / "instances"):
+    if figures.instances(place, folder / FIGURES / "instances.png"):
         caption = f"Instances of the tasks, {COLUMNS[PICTURED].label}."
         blocks.append(Picture(Path(FIGURES, "instances.png"), caption))
-    if figures.storyboard(place, folder / FIGURES / "storyboard", "door"):
+    if figures.storyboard(place, folder / FIGURES / "storyboard.png", "door"):
         caption = "Regularly timed stills of one episode of door opening."
         blocks.append(Picture(Path(FIGURES, "storyboard.png"), caption))
     if not blocks:

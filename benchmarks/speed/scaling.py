@@ -21,6 +21,7 @@ import numpy as np
 import envs
 import rmp_mjx as rmp
 from benchmarks.common import Row, measure, show, write_json
+from benchmarks.png import save_figure
 from benchmarks.speed.bench_controller import random_states
 from benchmarks.speed.gate import state_bytes
 from rmp_mjx import runtime
@@ -206,8 +207,7 @@ def plot(curves: Sequence[Curve], path: Path) -> None:
         ax.minorticks_off()
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    save_figure(figure, path, dpi=130)
     plt.close(figure)
 
 

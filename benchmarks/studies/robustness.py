@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.common import Row, insert, markdown, show, write_json
+from benchmarks.png import save_figure
 from benchmarks.studies import failures
 from benchmarks.studies.random_policies import NEAR, REACHING_LIMIT
 from benchmarks.studies.sweeps import (
@@ -155,8 +156,7 @@ def plot(results: Results, path: Path) -> None:
         axes.legend(fontsize=7)
     for axes in grid[:, 0]:
         axes.set_ylabel("events per 1,000 policy steps")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path, dpi=150)
     plt.close(figure)
 
 

@@ -16,6 +16,7 @@ from jax import Array
 
 import rmp_mjx as rmp
 from benchmarks.common import Row, measure, show, write_json
+from benchmarks.png import save_figure
 from benchmarks.studies.root_systems import CLEARANCES, RootSampler, RootSystems
 from rmp_mjx import runtime
 from rmp_mjx.math import psd_solve
@@ -202,8 +203,7 @@ def plot(rows: list[Row], path: Path) -> None:
     axes[0].set_ylabel("median relative error of qdd, float32")
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    save_figure(figure, path, dpi=130)
     plt.close(figure)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 import envs
 from benchmarks.common import Row, show, write_json
+from benchmarks.png import save_figure
 from envs.safety import Motion, Torques, observe
 from rmp_mjx import runtime
 from rmp_mjx.robot.kinematics import site_pose
@@ -240,8 +241,7 @@ def plot(rows: list[Row], path: Path) -> None:
     axes.minorticks_off()
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path, dpi=150)
     plt.close(figure)
 
 

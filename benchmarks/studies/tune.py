@@ -26,6 +26,7 @@ from jax import Array
 
 import envs
 from benchmarks.common import Row, show, write_json
+from benchmarks.png import save_figure
 from benchmarks.studies import experts
 from benchmarks.studies.parameters import Parameters
 from benchmarks.studies.random_policies import REACHING_LIMIT, poisson
@@ -240,8 +241,7 @@ def plot(trials: list[dict[str, Any]], path: Path) -> None:
     axes.set(yscale="log", xlabel="progress lost [%]", ylabel="events left [%]")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path, dpi=150)
     plt.close(figure)
 
 
