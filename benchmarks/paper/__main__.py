@@ -20,22 +20,24 @@ from rmp_mjx.training.config import ConfigError
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train and deploy what is missing of the paper's grid, then write the pages."""
+    """Train and deploy what is missing of the paper's grid, then write the page."""
 
     preset: Literal["smoke", "cpu", "full"] = "smoke"
     """smoke: minutes, tiny runs; cpu: 1.5 M steps, five seeds; full: ten seeds."""
     folder: Path | None = None
     """The store; default: runs/paper/PRESET. What is finished there is not repeated."""
-    pages: Path | None = None
-    """Where the pages go; default: docs/results, of smoke the store's folder pages."""
+    page: Path | None = None
+    """Where the page goes; default: docs/results, of smoke the store's folder page."""
     only: str | None = None
-    """One cell, as TASK/VARIANT/SEED: no pages, but the fingerprints of its results."""
+    """One cell, as TASK/VARIANT/SEED: no page, but the fingerprints of its results."""
     baselines: bool = False
     """Also train and deploy the baselines, after the paper's two controllers."""
     seconds: float | None = None
     """Stop at the next safe point after this long [s]; the same command goes on."""
     report: bool = False
-    """Only write the pages, from what is in the store."""
+    """Only write the page, from what is in the store."""
+    pack: Path | None = None
+    """Only write what is in the store as a few small files into this folder."""
     allow_changes: bool = False
     """Continue interrupted runs although the code has changed."""
 
@@ -45,10 +47,13 @@ def main(args: Sequence[str] | None = None) -> int:
     options = cli.parse(Options, args)
     preset = PRESETS[options.preset]
     place = Store(options.folder or cells.home(preset))
-    own = place.folder / "pages" if preset.name == "smoke" else Path("docs/results")
+    own = place.folder / "page" if preset.name == "smoke" else Path("docs/results")
     console = Console()
     code = 0
     try:
+        if options.pack:
+            _say(console, place.pack(options.pack))
+            return 0
         if options.seconds is not None and not options.seconds > 0:
             raise ConfigError(f"seconds must be positive, is {options.seconds}")
         wanted = preset.cells(options.baselines)
@@ -62,13 +67,18 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.only:
             _fingerprints(Store(place.folder), wanted[0])
             return code
-        written = report.write(Store(place.folder), preset, options.pages or own)
+        page = report.write(Store(place.folder), preset, options.page or own)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return code or 2
+    _say(console, [page])
+    return code
+
+
+def _say(console: Console, written: Sequence[Path]) -> None:
+    """Name the files that were written."""
     for path in written:
         console.print(f"written: {path}", markup=False, highlight=False)
-    return code
 
 
 def _fingerprints(place: Store, cell: Cell) -> None:

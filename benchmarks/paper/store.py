@@ -1,9 +1,16 @@
-"""The store: parquet files, each a finished part with what it was made from and how."""
+"""The store: what was measured, as parquet files with what it was made from and how.
+
+While the experiment runs, every finished part is a file of its own: KIND/PART.parquet.
+`pack` merges them into one file a kind, with the columns that the page reads, and
+parts.parquet, which says of each part how it was made. A store may hold both: a part's
+own file comes before what is packed. A cell's policy is policies/CELL.safetensors.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +25,50 @@ KEY = "rmp_mjx"
 """Key of the provenance in a parquet file's metadata."""
 TRAINING, EPISODES, EVENTS = "training", "episodes", "events"
 """Kinds of parts: curves by iteration; deployed episodes; what events were."""
+PLACE = ("task", "variant", "seed", "column")
+"""Columns that say which part a row belongs to; training has no `column`."""
+PARTS, POLICIES = "parts.parquet", "policies"
+"""The provenance of packed parts, and the folder of the policies."""
+PACKED = {
+    TRAINING: (
+        *PLACE[:3],
+        "steps",
+        "time/steps_per_s",
+        "episode/finished",
+        "episode/return",
+        "episode/success",
+        "episode/length",
+        "episode/collision",
+        "episode/self_collision",
+        "episode/joint_limit",
+        "episode/contact_force_peak",
+        "per_1000_steps/collision",
+        "per_1000_steps/self_collision",
+        "per_1000_steps/joint_limit",
+    ),
+    EPISODES: (
+        *PLACE,
+        "return",
+        "length",
+        "success",
+        "collision",
+        "arm_collision",
+        "obstacle_collision",
+        "self_collision",
+        "joint_limit",
+        "contact_force_peak",
+        "contact_impulse",
+        "clearance",
+        "joint_jerk",
+        "torque_saturation",
+        "unplaced_obstacles",
+        "lost",
+    ),
+    EVENTS: None,
+}
+"""Columns that are packed, where a kind has them; None: all."""
+LEVEL = 22
+"""Compression of packed files: zstd's strongest."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +79,12 @@ class Store:
     """Its folder."""
 
     def path(self, kind: str, cell: Cell, column: str | None = None) -> Path:
-        """Where a part is."""
-        name = cell.file + (f"-{column}" if column else "")
-        return self.folder / kind / f"{name}.parquet"
+        """Where a part's own file is."""
+        return self.folder / kind / f"{_name(cell, column)}.parquet"
+
+    def policy(self, cell: Cell) -> Path:
+        """Where a cell's trained policy is."""
+        return self.folder / POLICIES / f"{cell.file}.safetensors"
 
     def write(
         self,
@@ -49,12 +103,7 @@ class Store:
             cell: Its cell.
             column: Its deployment, where it has one.
         """
-        place: dict[str, Any] = {
-            "task": cell.task,
-            "variant": cell.variant,
-            "seed": cell.seed,
-        }
-        place |= {"column": column} if column else {}
+        place = _place(cell, column)
         about = {"kind": kind, **place, **about, "digest": digest(rows)}
         keys = [pl.lit(value).alias(name) for name, value in place.items()]
         path = self.path(kind, cell, column)
@@ -68,7 +117,9 @@ class Store:
         self, kind: str, cell: Cell, column: str | None = None
     ) -> dict[str, Any] | None:
         """Provenance of a part; None where there is none that can be read."""
-        return _about(self.path(kind, cell, column))
+        own = _read(self.path(kind, cell, column))
+        packed = self._packed_parts.get((kind, _name(cell, column)))
+        return own[0] if own else packed
 
     def holds(
         self,
@@ -100,14 +151,91 @@ class Store:
 
     @property
     def provenance(self) -> list[dict[str, Any]]:
-        """Provenance of every part."""
-        found = (_about(p) for p in sorted(self.folder.glob("*/*.parquet")))
-        return [about for about in found if about]
+        """Provenance of every part, in the order of kinds and names."""
+        found = dict(self._packed_parts)
+        for kind in PACKED:
+            for name, (about, _) in self._own_parts(kind).items():
+                found[kind, name] = about
+        return [found[part] for part in sorted(found)]
+
+    def pack(self, folder: Path) -> list[Path]:
+        """Write all parts as a few small files, and the policies beside them.
+
+        Args:
+            folder: Where they go; it may be the store's own folder.
+
+        Returns:
+            The files but for the policies.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        abouts = self.provenance
+        files = {PARTS: pl.DataFrame({"about": [json.dumps(each) for each in abouts]})}
+        for kind, columns in PACKED.items():
+            rows = self._all(kind)
+            kept = [name for name in columns or rows.columns if name in rows.columns]
+            files[f"{kind}.parquet"] = rows.select(kept)
+        for name, rows in files.items():
+            with replacing(folder / name) as temporary:
+                rows.write_parquet(
+                    temporary,
+                    compression_level=LEVEL,
+                    statistics=False,
+                    row_group_size=max(1, len(rows)),
+                )
+        policies = folder / POLICIES
+        policies.mkdir(exist_ok=True)
+        for path in sorted((self.folder / POLICIES).glob("*.safetensors")):
+            if path.parent.resolve() != policies.resolve():
+                shutil.copy(path, policies)
+        return [folder / name for name in files]
 
     def _all(self, kind: str) -> pl.DataFrame:
-        paths = sorted((self.folder / kind).glob("*.parquet"))
-        frames = [pl.read_parquet(path) for path in paths if _about(path)]
+        """All rows of a kind, part by part."""
+        own = {name: rows for name, (_, rows) in self._own_parts(kind).items()}
+        parts = self._packed_rows(kind) | own
+        frames = [parts[name] for name in sorted(parts)]
         return pl.concat(frames, how="diagonal_relaxed") if frames else pl.DataFrame()
+
+    def _own_parts(self, kind: str) -> dict[str, tuple[dict[str, Any], pl.DataFrame]]:
+        """Parts with a file of their own, by name."""
+        paths = (self.folder / kind).glob("*.parquet")
+        return {path.stem: found for path in paths if (found := _read(path))}
+
+    @cached_property
+    def _packed_parts(self) -> dict[tuple[str, str], dict[str, Any]]:
+        """Provenance of packed parts by kind and name."""
+        path = self.folder / PARTS
+        if not path.exists():
+            return {}
+        abouts = map(json.loads, pl.read_parquet(path)["about"])
+        return {(each["kind"], _name_of(each)): each for each in abouts}
+
+    def _packed_rows(self, kind: str) -> dict[str, pl.DataFrame]:
+        """Rows of packed parts by name."""
+        path = self.folder / f"{kind}.parquet"
+        if not path.exists():
+            return {}
+        rows = pl.read_parquet(path)
+        keys = [name for name in PLACE if name in rows.columns]
+        parts = rows.partition_by(keys, maintain_order=True)
+        return {_name_of(part.row(0, named=True)): part for part in parts}
+
+
+def _name(cell: Cell, column: str | None) -> str:
+    """The name of a part."""
+    return f"{cell.file}-{column}" if column else cell.file
+
+
+def _name_of(values: dict[str, Any]) -> str:
+    """The name of the part that a row or a provenance belongs to."""
+    cell = Cell(values["task"], values["variant"], values["seed"])
+    return _name(cell, values.get("column"))
+
+
+def _place(cell: Cell, column: str | None) -> dict[str, Any]:
+    """What says where a part's rows belong."""
+    place = {"task": cell.task, "variant": cell.variant, "seed": cell.seed}
+    return {**place, "column": column} if column else place
 
 
 def digest(rows: pl.DataFrame) -> str:
@@ -116,10 +244,11 @@ def digest(rows: pl.DataFrame) -> str:
     return hashlib.sha256(values.encode()).hexdigest()[:16]
 
 
-def _about(path: Path) -> dict[str, Any] | None:
+def _read(path: Path) -> tuple[dict[str, Any], pl.DataFrame] | None:
+    """Provenance and rows of a part's own file; None where it is not sound."""
     try:
         found = json.loads(pl.read_parquet_metadata(path)[KEY])
-        pl.read_parquet(path)  # the footer alone may be sound
+        rows = pl.read_parquet(path)  # the footer alone may be sound
     except (OSError, KeyError, ValueError, pl.exceptions.PolarsError):
         return None
-    return found if "definition" in found else None
+    return (found, rows) if "definition" in found else None
