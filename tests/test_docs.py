@@ -72,3 +72,15 @@ def test_the_pages_name_tests_that_exist():
     named = set(re.findall(r"(?:[\w/]+/)?test_\w+\.py", text))
     assert len(named) > 10
     assert not [n for n in named if n not in names and n not in tests]
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", "CONTRIBUTING.md", "benchmarks/README.md"]
+)
+def test_links_outside_the_site_lead_to_files(page):
+    """`mkdocs build --strict` checks those inside."""
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", (ROOT / page).read_text())
+    assert links
+    assert not [
+        link for link in links if not (ROOT / page).parent.joinpath(link).exists()
+    ]
