@@ -17,7 +17,11 @@ from rmp_mjx.training.evaluation import evaluate, figures, film, report
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs import distributed, metrics, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
+from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import TrainingFailure, train
+
+COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.replay")
+"""What messages of a run tell its user to type."""
 
 
 def finish(env, agent, config: TrainConfig, folder, console: Console) -> None:
@@ -88,7 +92,7 @@ def run(config: TrainConfig, console: Console) -> int:
             **options,
         )
         try:
-            result = train(env, config, folder, console)
+            result = train(env, config, folder, console, COMMANDS)
         except (CheckpointError, TrainingFailure, ConfigError) as error:
             print(f"error: {error}", file=sys.stderr)
             return 2 if isinstance(error, ConfigError) else 1

@@ -47,7 +47,7 @@ TRAINING = {
 }
 TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}
 KNOW_MUJOCO = {"robot", "sim"}
-COMMAND_LINE = {"envs.cli", "envs.grid"}  # where tasks and training meet
+COMMAND_LINE = {"envs.cli", "envs.grid", "envs.replay"}  # where tasks and training meet
 
 
 def modules(package: str) -> list[Path]:

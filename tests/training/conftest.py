@@ -9,6 +9,7 @@ from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.checkpoint import Checkpointer
+from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import train
 from tests.training import toys
 
@@ -34,7 +35,8 @@ def run(folder, console=None, **changes):
     folder, lock = run_folder.open_run(config)
     with lock:
         console = console or Console(quiet=True)
-        return train(toys.Counter(), config, folder, console), config
+        commands = Commands(resume="train --resume")
+        return train(toys.Counter(), config, folder, console, commands), config
 
 
 def bits(leaf):

@@ -139,8 +139,8 @@ class Checkpointer:
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(arrays),  # pyright: ignore
-                    manifest=ocp.args.JsonSave(  # pyright: ignore
+                    state=ocp.args.StandardSave(arrays),
+                    manifest=ocp.args.JsonSave(
                         {"arrays": manifest, "sha256": _digest(manifest)}
                     ),
                 ),
@@ -223,7 +223,7 @@ class Checkpointer:
         """Arrays by path, every one verified."""
         manifest = self._manager.restore(
             step,
-            args=ocp.args.Composite(manifest=ocp.args.JsonRestore()),  # pyright: ignore
+            args=ocp.args.Composite(manifest=ocp.args.JsonRestore()),
         )["manifest"]
         if _digest(manifest["arrays"]) != manifest["sha256"]:
             raise CheckpointError("the manifest fails its checksum")
@@ -235,7 +235,7 @@ class Checkpointer:
         arrays = self._manager.restore(
             step,
             args=ocp.args.Composite(
-                state=ocp.args.StandardRestore(shapes)  # pyright: ignore
+                state=ocp.args.StandardRestore(shapes)
             ),
         )["state"]
         stored = {}

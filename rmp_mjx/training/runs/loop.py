@@ -13,8 +13,9 @@ from rmp_mjx.training.runs import distributed, run_folder
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs.checkpoint import NEWEST, Checkpointer
 from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.logging import RunLogger
-from rmp_mjx.training.runs.metrics import make_rows
+from rmp_mjx.training.runs.metrics import Row, make_rows
 from rmp_mjx.training.learning.networks import Agent, make_agent
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.learning.state import TrainState
@@ -43,7 +44,11 @@ class TrainResult:
 
 
 def train(
-    env: Env, config: TrainConfig, folder: Path, console: Console | None = None
+    env: Env,
+    config: TrainConfig,
+    folder: Path,
+    console: Console | None = None,
+    commands: Commands | None = None,
 ) -> TrainResult:
     """Train a policy, or continue training one.
 
@@ -52,6 +57,7 @@ def train(
         config: Validated configuration; `config.resume` continues `folder`.
         folder: Run folder, prepared by `run_folder.open_run`.
         console: Terminal.
+        commands: The application's commands, for messages; None: it has none.
 
     Returns:
         The trained policy and how training ended.
@@ -61,67 +67,21 @@ def train(
         TrainingFailure: The simulation or the learner became non-finite, or nothing
             can be saved.
     """
-    programs = seeds.programs(env, config)
-    mesh = programs.mesh
-    primary = distributed.is_primary()
     console = console or Console()
-    checkpoints = None
-    if primary or config.resume:
-        kept = config.checkpoints_kept
-        place = folder / run_folder.CHECKPOINTS
-        checkpoints = Checkpointer(place, kept, config.keep_every, not primary)
-    state, done = _start(programs, config, checkpoints, console)
-    changes = run_folder.describe(folder, config) if primary else []
-    console.print(f"training on {run_folder.device(mesh.size)}", highlight=False)
-    if changes:
-        console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)
-    logger = None
-    if primary:
-        logger = RunLogger(
-            folder / run_folder.METRICS,
-            config.num_iterations,
-            done,
-            console,
-            open_trackers(
-                config,
-                folder,
-                folder / run_folder.TENSORBOARD,
-                done * config.steps_per_iteration if config.resume else None,
-            ),
-        )
+    commands = commands or Commands()
+    programs = seeds.programs(env, config)
+    checkpoints = _open_checkpoints(config, folder)
+    state, first = _start(programs, config, checkpoints, console)
+    _announce(config, folder, programs.mesh.size, console)
+    primary = distributed.is_primary()
+    logger = _open_logger(config, folder, first, console) if primary else None
     note = logger.note if logger else console.print
-    saver = Saver(checkpoints if primary else None, folder, note, done)
-    watch = Watch(config, folder, note)
-    first = done
-    stopping = 0
+    own = checkpoints if primary else None
+    saver = Saver(own, folder, note, first, commands)
+    watch = Watch(config, folder, note, commands)
+    loop = _Loop(config, programs, logger, saver, watch)
     with StopRequest() as stop, logger or nullcontext():
-        while done < config.num_iterations and not stopping:
-            began = time.monotonic()
-            state, data, stats = programs.gather(state)
-            state, learning = programs.learn(state, data)
-            jax.block_until_ready(state)
-            done += 1
-            seconds = time.monotonic() - began
-            rows = make_rows(config, done, seconds, stats, learning)
-            last = done == config.num_iterations
-            if logger and (last or done % config.log_interval == 0):
-                logger.add(*rows)
-            saver.count(rows)
-            fault = None
-            if any(row["nonfinite_envs"] for row in rows):
-                fault = distributed.collected(state.rollout.fault, mesh)
-            if primary:
-                watch.report(rows, fault)
-            broken = watch.abort_reason(rows)
-            stopping = distributed.largest(stop.signal or 0)
-            final = bool(last or stopping or broken)
-            if final or done % config.checkpoint_interval == 0:
-                if logger:
-                    logger.flush()
-                if not broken or is_finite(state):
-                    saver.save(done, distributed.collected(state, mesh), final)
-            if broken:
-                raise TrainingFailure(f"{broken}; {saver.how_to_continue()}")
+        state, done, stopping = loop.run(state, first, stop)
     if checkpoints:
         checkpoints.close()
     if stopping:
@@ -139,6 +99,106 @@ def train(
         exit_code=128 + stopping if stopping else 0,
         had_finished=first >= config.num_iterations,
     )
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """The iterations of a run, and what happens after each."""
+
+    config: TrainConfig
+    """Validated configuration."""
+    programs: seeds.Programs
+    """The compiled parts of an iteration."""
+    logger: RunLogger | None
+    """Where rows go; None: another process reports."""
+    saver: Saver
+    """Writes the checkpoints."""
+    watch: Watch
+    """Looks for bad numbers."""
+
+    def run(
+        self, state: TrainState, done: int, stop: StopRequest
+    ) -> tuple[TrainState, int, int]:
+        """Iterate until the end of the run or a signal to any process.
+
+        Args:
+            state: Where to start; it is consumed.
+            done: Finished iterations.
+            stop: Catches signals.
+
+        Returns:
+            The last state, its finished iterations, and the signal or 0.
+        """
+        config, stopping = self.config, 0
+        while done < config.num_iterations and not stopping:
+            state, rows = self.iterate(state, done + 1)
+            done += 1
+            broken = self.report(state, rows)
+            stopping = distributed.largest(stop.signal or 0)
+            final = bool(done == config.num_iterations or stopping or broken)
+            if final or done % config.checkpoint_interval == 0:
+                self.save(state, done, final, bool(broken))
+            if broken:
+                raise TrainingFailure(f"{broken}; {self.saver.how_to_continue()}")
+        return state, done, stopping
+
+    def iterate(self, state: TrainState, number: int) -> tuple[TrainState, list[Row]]:
+        """Gather and learn; the new state and its rows, one for each seed."""
+        began = time.monotonic()
+        state, data, stats = self.programs.gather(state)
+        state, learning = self.programs.learn(state, data)
+        jax.block_until_ready(state)
+        seconds = time.monotonic() - began
+        return state, make_rows(self.config, number, seconds, stats, learning)
+
+    def report(self, state: TrainState, rows: list[Row]) -> str | None:
+        """Log the rows and look for bad numbers; why training must stop, or None."""
+        done = int(rows[0]["iteration"] or 0)
+        last = done == self.config.num_iterations
+        if self.logger and (last or done % self.config.log_interval == 0):
+            self.logger.add(*rows)
+        self.saver.count(rows)
+        fault = None
+        if any(row["nonfinite_envs"] for row in rows):
+            fault = distributed.collected(state.rollout.fault, self.programs.mesh)
+        if self.logger:
+            self.watch.report(rows, fault)
+        return self.watch.abort_reason(rows)
+
+    def save(self, state: TrainState, done: int, final: bool, broken: bool) -> None:
+        """Write a checkpoint, unless what was learned is broken itself."""
+        if self.logger:
+            self.logger.flush()
+        if not broken or is_finite(state):
+            whole = distributed.collected(state, self.programs.mesh)
+            self.saver.save(done, whole, final)
+
+
+def _open_checkpoints(config: TrainConfig, folder: Path) -> Checkpointer | None:
+    """The run's checkpoints; None for a process that neither reads nor writes them."""
+    primary = distributed.is_primary()
+    if not primary and not config.resume:
+        return None
+    place = folder / run_folder.CHECKPOINTS
+    return Checkpointer(place, config.checkpoints_kept, config.keep_every, not primary)
+
+
+def _open_logger(
+    config: TrainConfig, folder: Path, done: int, console: Console
+) -> RunLogger:
+    """The logger of a new run, or of one that continues after `done` iterations."""
+    after = done * config.steps_per_iteration if config.resume else None
+    trackers = open_trackers(config, folder, folder / run_folder.TENSORBOARD, after)
+    path = folder / run_folder.METRICS
+    return RunLogger(path, config.num_iterations, done, console, trackers)
+
+
+def _announce(config: TrainConfig, folder: Path, devices: int, console: Console):
+    """Write what the run uses into its folder, and print its devices."""
+    changes = run_folder.describe(folder, config) if distributed.is_primary() else []
+    console.print(f"training on {run_folder.device(devices)}", highlight=False)
+    if changes:
+        console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)
 
 
 def _start(

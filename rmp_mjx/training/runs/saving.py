@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.commands import Commands, then
 from rmp_mjx.training.runs.checkpoint import MERITS, Checkpointer, SaveError
 from rmp_mjx.training.runs.metrics import Row
 from rmp_mjx.training.runs.stopping import TrainingFailure
@@ -23,6 +24,7 @@ class Saver:
         folder: Path,
         note: Callable[[str], None],
         last: int,
+        commands: Commands,
     ):
         """Start from a run's last checkpoint.
 
@@ -31,11 +33,13 @@ class Saver:
             folder: The run's folder, for messages.
             note: Called with one line if a save fails.
             last: Iteration of the last checkpoint; 0: there is none.
+            commands: The application's commands, for messages.
         """
         self.last = last
         self._checkpoints = checkpoints
         self._folder = folder
         self._note = note
+        self._commands = commands
         self._failed = False
         self._episodes = 0
         self._sums = dict.fromkeys(MERITS, 0.0)
@@ -84,10 +88,8 @@ class Saver:
         """What is saved, and the command that continues from there."""
         if not self.last:
             return "nothing is saved yet"
-        return (
-            f"saved is iteration {self.last}; continue with\n"
-            f"  python train.py --resume {self._folder}"
-        )
+        command = then("continue with", self._commands.resume, self._folder)
+        return f"saved is iteration {self.last}{command}"
 
 
 def _room(folder: Path) -> str:

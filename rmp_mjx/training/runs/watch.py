@@ -10,6 +10,7 @@ import numpy as np
 from rmp_mjx.training.learning import faults, seeds
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.runs.commands import Commands, then
 from rmp_mjx.training.runs.metrics import SEED, Row
 from rmp_mjx.training.learning.state import TrainState
 
@@ -22,7 +23,13 @@ MAX_DUMPS = 5
 class Watch:
     """Checks every iteration; reports and writes what it finds."""
 
-    def __init__(self, config: TrainConfig, folder: Path, note: Callable[[str], None]):
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: Path,
+        note: Callable[[str], None],
+        commands: Commands,
+    ):
         """Nothing has happened yet.
 
         Args:
@@ -33,6 +40,7 @@ class Watch:
         self._config = config
         self._folder = folder / run_folder.NONFINITE
         self._note = note
+        self._commands = commands
         self._reported: set[str] = set()
 
     def _once(self, kind: str, message: str) -> None:
@@ -97,8 +105,9 @@ class Watch:
             self._once(
                 "nonfinite",
                 f"warning: iteration {row['iteration']}: {row['nonfinite_envs']} "
-                "environments became non-finite and were reset, their steps left out; "
-                f"inspect it with\n  python -m benchmarks.replay {files[0]}",
+                "environments became non-finite and were reset, their steps left out, "
+                f"the first ones written to {self._folder}"
+                + then("inspect one with", self._commands.replay, files[0]),
             )
 
 

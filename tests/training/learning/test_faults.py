@@ -12,6 +12,7 @@ from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import run_folder, watch
+from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import train
 from tests.training import toys
 from tests.training.conftest import SMALL, bits
@@ -62,9 +63,9 @@ def poisoned(tmp_path_factory):
     folder, lock = run_folder.open_run(config)
     text = io.StringIO()
     with lock:
-        train(
-            toys.Poisoned(poison=np.nan), config, folder, Console(file=text, width=200)
-        )
+        console = Console(file=text, width=200)
+        env = toys.Poisoned(poison=np.nan)
+        train(env, config, folder, console, Commands(replay="replay"))
     return folder, text.getvalue()
 
 
@@ -74,7 +75,7 @@ def test_bad_steps_are_counted_said_once_and_a_few_are_written(poisoned):
     files = sorted((folder / run_folder.NONFINITE).glob("*.npz"))
     assert counted.sum() > len(files) == watch.MAX_DUMPS
     assert said.count("became non-finite") == 1
-    assert f"benchmarks.replay {folder / run_folder.NONFINITE}" in said
+    assert f"inspect one with\n  replay {folder / run_folder.NONFINITE}" in said
 
 
 def test_a_written_step_becomes_bad_again(poisoned):
@@ -107,7 +108,7 @@ def row(**changes):
 
 def test_contacts_that_were_not_read_are_said_once(tmp_path):
     notes = []
-    watching = watch.Watch(CONFIG, tmp_path, notes.append)
+    watching = watch.Watch(CONFIG, tmp_path, notes.append, Commands())
     for share in (None, 0.0, 0.25, 0.5):
         watching.report([row(**{"episode/contact_overflow": share})], None)
     (said,) = notes
@@ -115,7 +116,7 @@ def test_contacts_that_were_not_read_are_said_once(tmp_path):
 
 
 def test_training_goes_on_with_some_skipped_updates_and_not_without_any_other(tmp_path):
-    watching = watch.Watch(CONFIG, tmp_path, pytest.fail)
+    watching = watch.Watch(CONFIG, tmp_path, pytest.fail, Commands())
     updates = CONFIG.num_updates_per_batch * CONFIG.num_minibatches
     some, all_of_them = (
         row(**{"learning/skipped_updates": float(n)}) for n in (updates - 1, updates)

@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
+from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer, SaveError
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.saving import Saver
@@ -60,7 +61,7 @@ def test_a_failed_save_leaves_what_was_there_and_nothing_else(tmp_path, full):
 def saver(tmp_path):
     notes = []
     store = Checkpointer(tmp_path / "checkpoints")
-    made = Saver(store, tmp_path, notes.append, 0)
+    made = Saver(store, tmp_path, notes.append, 0, Commands("train --resume"))
     made.notes = notes
     yield made
     store.close()
@@ -126,6 +127,7 @@ import io, sys
 from pathlib import Path
 from rich.console import Console
 from rmp_mjx import runtime
+from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.stopping import TrainingFailure
 from tests.training.conftest import run

@@ -1,8 +1,9 @@
 """Replay a step that became non-finite, in MuJoCo C, one physics step at a time.
 
-`python -m benchmarks.replay RUN/nonfinite/NAME.npz` reads what training wrote (state
-before the step, action, key), goes through the policy step, and names the first
-quantity that is not finite or beyond its limit.
+`python -m envs.replay RUN` takes the first such step of a run, RUN/nonfinite/NAME.npz
+another one. It reads what training wrote (state before the step, action, key), goes
+through the policy step, and names the first quantity that is not finite or beyond its
+limit.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +27,7 @@ from rmp_mjx import runtime
 from rmp_mjx.training.config import config_of
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.rollout import VALUE_LIMIT
+from rmp_mjx.training.runs import run_folder
 
 SPEED_LIMIT = 1e3
 """Joint speeds beyond this count as bad; so they do in the tasks [rad/s]."""
@@ -147,6 +150,20 @@ def first_bad(
     return None
 
 
+def choose(path: Path) -> Path:
+    """The file itself, or the earliest one in the folder of a run.
+
+    Raises:
+        ValueError: The run has none.
+    """
+    if not path.is_dir():
+        return path
+    files = sorted((path / run_folder.NONFINITE).glob("*.npz"))
+    if not files:
+        raise ValueError(f"{path} has no non-finite steps in {run_folder.NONFINITE}/")
+    return min(files, key=lambda file: faults.about(file)["iteration"])
+
+
 def read(path: Path) -> tuple[envs.ArmEnv, envs.State, np.ndarray, dict[str, Any]]:
     """The task, state, action and origin in a file.
 
@@ -169,14 +186,17 @@ def read(path: Path) -> tuple[envs.ArmEnv, envs.State, np.ndarray, dict[str, Any
 def main(args: Sequence[str] | None = None) -> int:
     """Replay a file, print a table and the finding; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("dump", type=Path, help="RUN/nonfinite/NAME.npz")
-    parser.add_argument("--limit", type=float, default=VALUE_LIMIT)
+    parser.add_argument("dump", type=Path, help="RUN or RUN/nonfinite/NAME.npz")
+    parser.add_argument(
+        "--limit", type=float, default=VALUE_LIMIT, help="greatest good magnitude"
+    )
     options = parser.parse_args(args)
     runtime.configure()
+    say = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
     try:
-        env, state, action, about = read(options.dump)
+        env, state, action, about = read(choose(options.dump))
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
+        Console(stderr=True).print(f"error: {error}", markup=False, soft_wrap=True)
         return 2
     moments: list[Moment] = []
     found = first_bad(policy_step(env, state, action), options.limit, moments)
@@ -191,9 +211,9 @@ def main(args: Sequence[str] | None = None) -> int:
         table.add_row(moment.place, *cells)
     Console().print(table)
     if found:
-        print(f"first bad number: {found.name} = {found.value:g}, {found.place}")
+        say(f"first bad number: {found.name} = {found.value:g}, {found.place}")
     else:
-        print("every number is finite and within its limit in MuJoCo C")
+        say("every number is finite and within its limit in MuJoCo C")
     return 0
 
 

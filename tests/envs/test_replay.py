@@ -1,6 +1,7 @@
 """Replaying a written step in MuJoCo C."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 import envs
-from benchmarks import replay
+from envs import replay
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning import faults
+from rmp_mjx.training.runs import run_folder
 
 CONFIG = TrainConfig(
     controller="vices",
@@ -87,6 +89,19 @@ def test_the_first_bad_number_is_named(written, capsys, name, change, said):
     out = capsys.readouterr().out
     assert said in out
     assert "trajectory, iteration 3, seed 0, lane 1" in out
+
+
+def test_of_a_run_the_earliest_step_is_taken(written, tmp_path):
+    folder = tmp_path / run_folder.NONFINITE
+    folder.mkdir()
+    with pytest.raises(ValueError, match="has no non-finite steps"):
+        replay.choose(tmp_path)
+    for iteration in (20, 3):
+        about = {"iteration": iteration, "config": {}}
+        name = folder / f"iteration{iteration}.npz"
+        np.savez(name, about=np.array(json.dumps(about)))
+    assert replay.choose(tmp_path) == folder / "iteration3.npz"
+    assert replay.choose(folder / "iteration20.npz") == folder / "iteration20.npz"
 
 
 def test_a_file_of_something_else_is_refused(tmp_path, capsys):
