@@ -57,9 +57,9 @@ def _summary(place: Store, preset: Preset) -> list[Block]:
     done = {(a["task"], a["variant"], a["seed"]) for a in trained}
     missing = [c for c in wanted if (c.task, c.variant, c.seed) not in done]
     text = (
-        "Made by {command} from {runs} training runs of {steps:,} policy steps each "
-        "and {episodes:,} deployed episodes. Of the {wanted} cells of the paper's two "
-        "controllers, {missing} are not trained yet."
+        "`{command}` made this page from {runs} training runs of {steps:,} policy "
+        "steps each and {episodes:,} episodes of deployment. The paper's two "
+        "controllers need {wanted} runs; {missing} of them are not trained yet."
     ).format(
         command=f"python -m benchmarks.paper --preset {preset.name}",
         runs=len(trained),
@@ -71,7 +71,7 @@ def _summary(place: Store, preset: Preset) -> list[Block]:
     blocks: list[Block] = [Heading(TITLE, 1), Text(text)]
     if preset.name == "smoke":
         blocks.append(
-            Text("This is a smoke test: its numbers mean nothing but that all runs.")
+            Text("This is a smoke test: it shows that everything runs, nothing more.")
         )
     return blocks
 
@@ -84,11 +84,11 @@ def _targets(place: Store) -> list[Block]:
         Heading("Targets"),
         Text(
             f"Of {len(found)} targets {met} are met, {failed} are not, and "
-            f"{undecided} are undecided: not measured, measured in "
-            "fewer than 100 episodes, or with nothing to compare. A verdict goes by "
-            "the measured value; the interval says how far it can be trusted. "
-            "Intervals of changes are paired bootstraps "
-            "over seeds (from three seeds on), of shares Clopper and Pearson's."
+            f"{undecided} are undecided. Undecided means not measured, measured in "
+            "fewer than 100 episodes, or nothing to compare with. The measured value "
+            "decides; the interval shows its uncertainty. Intervals of changes are "
+            "paired bootstraps over seeds, for three seeds or more. Intervals of "
+            "shares are Clopper and Pearson's."
         ),
         tables.of_targets(place),
     ]
@@ -98,9 +98,9 @@ def _reproduction(place: Store) -> list[Block]:
     return [
         Heading("What reproduces, and what does not"),
         Text(
-            "Each finding of the paper, by its direction. The paper says neither how "
-            "near its spheres were nor which physics settings it used, so that its "
-            "absolute numbers cannot be expected here; deployed means among "
+            "Each finding of the paper, and whether its direction is found here. The "
+            "paper gives neither the distance of its spheres nor its physics settings, "
+            "so its absolute numbers are not comparable. Policies are deployed with "
             f"{COLUMNS[PICTURED].label}."
         ),
         tables.reproduction(place, PICTURED),
@@ -117,15 +117,15 @@ def _training(place: Store, folder: Path) -> list[Block]:
             "over the seeds and its 95 % interval (Student's t).",
         ),
         Text(
-            "Area under the mean curves, as mean height, and its change from VICES to "
-            "RMP-VICES as the paper computes it, over the steps where both have "
-            "finished episodes."
+            "Area under the mean curves, divided by the number of steps, and its "
+            "change from VICES to RMP-VICES, computed as in the paper. It covers the "
+            "steps where both have finished episodes."
         ),
         tables.training(place),
         Text(
-            "Events per thousand policy steps of the whole training, which do not "
-            "depend on how long episodes last; and the speed of training, updates "
-            "included."
+            "Events per 1,000 policy steps over the whole training; unlike events per "
+            "episode, they do not depend on the length of episodes. The last column is "
+            "the speed of training, updates included."
         ),
         tables.totals(place),
     ]
@@ -149,10 +149,11 @@ def _deployment(place: Store, folder: Path) -> list[Block]:
     blocks: list[Block] = [
         Heading("Deployment among unseen spheres"),
         Text(
-            "The best seed of each variant: the greatest mean return over the last "
-            f"{measures.LAST:.0%} of training. Policies act by their mean. All meet "
-            "the same starts, goals and spheres. An event ends the episode. The "
-            "paper's column has return, collisions and joint limits of 100 episodes."
+            "The best seed of each variant, which is the one with the greatest mean "
+            f"return over the last {measures.LAST:.0%} of training. Policies take the "
+            "mean action. All meet the same starts, goals and spheres. An event ends "
+            "the episode. The paper's column shows return, collisions and joint limits "
+            "of 100 episodes."
         ),
     ]
     for column in TABLE:
@@ -164,11 +165,10 @@ def _deployment(place: Store, folder: Path) -> list[Block]:
         Heading("Severity of collisions", 3),
         Picture(
             Path(FIGURES, "forces.png"),
-            "Greatest contact force of episodes with a contact. In deployment each "
-            "episode counts by itself. In training the record keeps means over the "
-            "episodes that finished in an iteration, so there an entry is the mean "
-            "over those of them that a contact ended, counted as often as they are. "
-            "The hand's contact with what it works on is left out.",
+            "Greatest contact force of each episode with a contact. Training keeps "
+            "only the mean over the episodes that finish in an iteration. There, each "
+            "of these episodes counts with the mean over those that a contact ended. "
+            "Contacts of the hand with the handle or the block are excluded.",
         ),
         Heading("Further measures", 3),
         Text(f"Best seeds among {COLUMNS[PICTURED].label}; means have 95 % intervals."),
@@ -189,16 +189,16 @@ def _beyond(place: Store, preset: Preset, folder: Path) -> list[Block]:
         Heading("Robustness"),
         Picture(
             Path(FIGURES, "robustness.png"),
-            "Best seeds in worlds that training never saw.",
+            "Best seeds under conditions that training did not have.",
         ),
-        Text("Success and episodes ended by an event, both in per cent."),
+        Text("Success, then episodes ended by an event, both in per cent."),
         tables.robustness(place, preset.columns),
         Heading("Every seed, and tests paired by seed"),
         tables.seeds(place, PICTURED),
         Text(
-            "RMP-VICES minus VICES with the same seed. The sign-flip test is exact and "
-            "makes no assumption, but with k seeds its p-value is never below 2 / 2^k. "
-            "No correction for the number of tests is made."
+            "RMP-VICES minus VICES with the same seed. The sign-flip test is exact, "
+            "but with k seeds its p-value cannot be below 2 / 2^k. There is no "
+            "correction for multiple tests."
         ),
         tables.paired(place, PICTURED),
     ]
@@ -217,11 +217,11 @@ def _failures(place: Store, folder: Path) -> list[Block]:
     blocks: list[Block] = [
         Heading("Where it still fails"),
         Text(
-            "What each event was that ended one of the recorded episodes (the first "
-            f"100 or fewer) of the best seeds among {COLUMNS[PICTURED].label}: "
-            f"{len(ours)} with RMP-VICES, {len(events) - len(ours)} with the others. "
-            "It is put down to the pair that is nearest when the policy step of the "
-            "event ends. Forces are normal forces; a joint limit has none."
+            "The events that ended recorded episodes. Recorded are the first 100 "
+            f"episodes of the best seeds with {COLUMNS[PICTURED].label}. There were "
+            f"{len(ours)} events with RMP-VICES and {len(events) - len(ours)} with the "
+            "others. Each is attributed to the pair that is closest at the end of its "
+            "policy step. Forces are normal forces; a joint limit has none."
         ),
     ]
     if not events.is_empty():
@@ -241,7 +241,7 @@ def _pictures(place: Store, folder: Path) -> list[Block]:
         caption = "Regularly timed stills of one episode of door opening."
         blocks.append(Picture(Path(FIGURES, "storyboard.png"), caption))
     if not blocks:
-        blocks.append(Text("There was no headless rendering where this was made."))
+        blocks.append(Text("Headless rendering was not available on this machine."))
     return [Heading("Pictures"), *blocks]
 
 
@@ -269,17 +269,19 @@ def _protocol(place: Store, preset: Preset) -> list[Block]:
     return [
         Heading("Protocol"),
         Text(
-            "All variants train with the same settings, below; none has settings of "
-            "its own. The parameters of RMP-VICES' leaves were chosen beforehand, "
-            "mostly on policies that learned nothing; its walls against spheres, at "
-            "door and push, with trained policies in 400 of the close layouts below. "
-            "VICES has its authors' gains, the safety filter the tree's points and "
-            "obstacles and 5 mm of margin; neither was tuned here. As in the paper: "
-            "two hidden layers of 64 with tanh, PPO, an event ends the episode, no "
-            "spheres in training. Not as in the paper: an "
-            f"iteration gathers {size:,} steps from {config['num_envs']} environments "
-            "at once; door and push last 256 policy steps instead of 1024, unless the "
-            "options below say otherwise; arm, scene and physics are this project's."
+            "All variants train with the same settings, listed below. The leaf "
+            "parameters of RMP-VICES were chosen before, mostly with policies that had learned "
+            "nothing. For door and push, the collision leaves of the spheres were "
+            "chosen with trained policies, on 400 of the close layouts below. VICES "
+            "has its authors' gains. The safety filter has the control points and "
+            "obstacles of the tree and a margin of 5 mm. Neither was tuned here. As in "
+            "the paper, the networks have two hidden layers of 64 with tanh, the "
+            "algorithm is PPO, an event ends the episode, and there are no spheres in "
+            "training. Unlike in the paper, an "
+            f"iteration gathers {size:,} steps from {config['num_envs']} environments, "
+            "episodes of door and push last 256 policy steps instead of 1024 unless "
+            "the options below say otherwise, and arm, scene and physics are this "
+            "project's."
         ),
         Code(
             f"python -m benchmarks.paper --preset {preset.name}\n"
@@ -287,9 +289,10 @@ def _protocol(place: Store, preset: Preset) -> list[Block]:
             "--only door/rmp_vices/0 --folder runs/again"
         ),
         Text(
-            "The second command repeats one cell; on the same machine and with the "
-            "same versions its fingerprint is the one below. A fingerprint is of all "
-            "values of the training curves but times."
+            "The first command makes what is missing, then this page. The second "
+            "repeats one run. On the same machine, with the same versions, its "
+            "fingerprint is the one below. A fingerprint is a hash of all values of "
+            "the training curves except times."
         ),
         tables.runs(place),
         page.Table(("provenance", ""), about),

@@ -366,7 +366,7 @@ def test_a_new_part_comes_before_what_is_packed(grid, tmp_path):
 def test_the_count_of_targets_is_that_of_the_tables_rows(page):
     text = page.read_text()
     counts = [text.count(f"| {word} |") for word in ("met", "NOT MET", "undecided")]
-    said = "Of {} targets {} are met, {} are not, and {} are undecided:"
+    said = "Of {} targets {} are met, {} are not, and {} are undecided."
     assert sum(counts) == 33 and counts[2] < 33
     assert said.format(33, *counts) in text
 
