@@ -10,9 +10,8 @@ from rich.console import Console
 
 import envs
 from envs import cli, grid
-from eval import engine
 from rmp_mjx import runtime, sim
-from rmp_mjx.training.config import ConfigError, TrainConfig, validate
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate, figures, film, report
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs import distributed, metrics, run_folder
@@ -27,49 +26,50 @@ COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.re
 def finish(env, agent, config: TrainConfig, folder, console: Console) -> None:
     """Evaluate, plot and film the policy of every seed; the primary process writes."""
     primary = distributed.is_primary()
-    title = f"{config.env}, {config.controller}, {seeds.title(config)}"
     if primary:
-        plot(config, folder, title)
-    if config.eval_episodes:
-        evaluate_seeds(env, agent, config, folder, title, console, primary)
+        plot(config, folder)
+    if config.run.eval_episodes:
+        evaluate_seeds(env, agent, config, folder, console, primary)
     console.print(f"results: {folder}", markup=False, highlight=False)
 
 
-def plot(config: TrainConfig, folder, title: str) -> None:
+def plot(config: TrainConfig, folder) -> None:
     """The learning curve, with several seeds that of all together too."""
     path, over_seeds = folder / run_folder.METRICS, None
-    if config.num_seeds > 1:
+    if config.ppo.num_seeds > 1:
         rows = pl.read_parquet(path)
         over_seeds = metrics.over_seeds(rows, figures.curves(rows))
         (folder / run_folder.SEEDS).mkdir(exist_ok=True)
         over_seeds.write_parquet(folder / run_folder.SEED_CURVES)
-    figures.plot_learning_curve(path, folder / run_folder.CURVE, title, over_seeds)
+    figures.plot_learning_curve(
+        path, folder / run_folder.CURVE, config.title, over_seeds
+    )
 
 
 def evaluate_seeds(
-    env, agent, config: TrainConfig, folder, title: str, console: Console, primary: bool
+    env, agent, config: TrainConfig, folder, console: Console, primary: bool
 ) -> None:
     """Run the evaluation's episodes with every seed's policy; report them."""
-    key = jax.random.key(config.seed + 1000)
-    filmed = film.EPISODES if config.video else 0
-    record = evaluate.recorder(env, config.eval_episodes, filmed)
-    about = {"agent": "policy", "deterministic": config.eval_deterministic}
+    key = jax.random.key(config.ppo.seed + 1000)
+    filmed = film.EPISODES if config.run.video else 0
+    record = evaluate.recorder(env, config.run.eval_episodes, filmed)
+    about = {"agent": "policy", "deterministic": config.run.eval_deterministic}
     columns, tapes = [], []
     for k, place in enumerate(run_folder.seed_folders(config, folder)):
-        results, tape = record(seeds.of_seed(agent, k, config), key)
+        results, tape = record(seeds.of_seed(agent, k, config.ppo), key)
         tapes.append(tape)
         if primary:
-            found = {engine(env): results}
+            found = {env.engine: results}
             columns.append(
-                report.save(found, env.metric_reductions, about, place, title)
+                report.save(found, env.metric_reductions, about, place, config.title)
             )
     if not primary:
         return
     shown = columns[0]
-    if config.num_seeds > 1:
+    if config.ppo.num_seeds > 1:
         shown = report.save_over_seeds(columns, about, folder)
-    console.print(report.table(shown, title, env.task_metrics))
-    if config.video:
+    console.print(report.table(shown, config.title, env.task_metrics))
+    if config.run.video:
         from envs.render import render  # loads graphics libraries
 
         film.publish(partial(render, env), tapes[0], env.dt, folder, console)
@@ -78,25 +78,19 @@ def evaluate_seeds(
 def run(config: TrainConfig, console: Console) -> int:
     """Train and evaluate one configuration; returns the exit code."""
     try:
-        options = envs.parse_options(config.env, config.env_options)
         folder, lock = distributed.open_run(config)
-    except ValueError as error:
+    except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     with lock:
         runtime.configure(split_cpu=distributed.alone())
-        env = envs.load(
-            config.env,
-            controller=config.controller,
-            physics=config.physics,
-            **options,
-        )
+        env = envs.make(config.task)
         try:
             result = train(env, config, folder, console, COMMANDS)
         except (CheckpointError, TrainingFailure, ConfigError) as error:
             print(f"error: {error}", file=sys.stderr)
             return 2 if isinstance(error, ConfigError) else 1
-        last = run_folder.EVALUATION if config.eval_episodes else run_folder.CURVE
+        last = run_folder.EVALUATION if config.run.eval_episodes else run_folder.CURVE
         reported = result.had_finished and (folder / last).exists()
         if not result.exit_code and not reported:
             finish(env, result.agent, config, folder, console)
@@ -107,14 +101,11 @@ def main(args: Sequence[str] | None = None) -> int:
     """Parse, check, train, evaluate; returns the exit code."""
     console = Console()
     try:
-        options = cli.parse_train(args)
-        wanted = options.grid
+        options, wanted = cli.parse_train(args)
         configs = list(wanted.cells().values()) if wanted else [options.config]
         for config in configs:
-            validate(config, envs.names())
-            sim.require(config.physics)
-            envs.parse_options(config.env, config.env_options)
-        distributed.join(options.coordinator, options.process_id, options.num_processes)
+            sim.require(config.task.physics)
+        distributed.join(**vars(options.processes))
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

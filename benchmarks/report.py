@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import base64
-import dataclasses
 import html
 import io
 import json
@@ -25,7 +24,8 @@ import polars as pl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from rmp_mjx.training.config import RESUMABLE, TrainConfig, load_config
+from envs.flags import load_config
+from rmp_mjx.training.config import TrainConfig, defining
 from rmp_mjx.training.evaluation.figures import curves
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.metrics import SEED, over_seeds
@@ -33,7 +33,7 @@ from rmp_mjx.training.stats import bootstrap_mean, clopper_pearson
 
 COLORS = ("#2a6fbb", "#c0504d", "#d9a13b", "#4f9d69", "#7d5ba6", "#5b5b5b")
 """One for each group, over and over."""
-NOT_DEFINING = RESUMABLE | {"seed", "num_seeds"}
+SEEDS = ("seed", "num_seeds")
 """Options in which the runs of a group may differ."""
 FIRST = ("episode/return", "episode/success")
 """Curves that a reader wants first."""
@@ -108,19 +108,19 @@ def read_run(folder: Path) -> list[Run]:
     Raises:
         ValueError: The folder is no run, or has no rows yet.
     """
-    config = load_config(folder / run_folder.CONFIG)
+    config = load_config(folder)
     path = folder / run_folder.METRICS
     if not path.exists():
         raise ValueError(f"{folder} has no rows yet: no {path.name}")
     rows = pl.read_parquet(path)
     if SEED not in rows.columns:
-        rows = rows.with_columns(pl.lit(config.seed).alias(SEED))
+        rows = rows.with_columns(pl.lit(config.ppo.seed).alias(SEED))
     runs = []
     for k, place in enumerate(run_folder.seed_folders(config, folder)):
-        own = rows.filter(pl.col(SEED) == config.seed + k)
+        own = rows.filter(pl.col(SEED) == config.ppo.seed + k)
         file = place / run_folder.EVALUATION
         evaluation = json.loads(file.read_text()) if file.exists() else {}
-        runs.append(Run(folder, config, config.seed + k, own, evaluation))
+        runs.append(Run(folder, config, config.ppo.seed + k, own, evaluation))
     return runs
 
 
@@ -128,27 +128,29 @@ def grouped(runs: Iterable[Run]) -> list[Group]:
     """Runs by what defines them, in the order in which they are first named."""
     by_config: dict[str, list[Run]] = {}
     for run in runs:
-        values = dataclasses.asdict(run.config).items()
-        defining = {name: value for name, value in values if name not in NOT_DEFINING}
-        by_config.setdefault(json.dumps(defining, sort_keys=True), []).append(run)
+        key = json.dumps(settings(run.config), sort_keys=True)
+        by_config.setdefault(key, []).append(run)
     found = [runs[0].config for runs in by_config.values()]
     varying = [name for name, values in differences(found).items() if len(values) > 1]
     groups: list[Group] = []
     for members, config in zip(by_config.values(), found, strict=True):
-        said = [f"{name} {_text(getattr(config, name))}" for name in varying]
-        name = ", ".join(said) or f"{config.env}, {config.controller}"
+        said = [f"{name} {_text(settings(config).get(name))}" for name in varying]
+        name = ", ".join(said) or config.task.title
         groups.append(Group(name, COLORS[len(groups) % len(COLORS)], members))
     return groups
 
 
+def settings(config: TrainConfig) -> dict[str, Any]:
+    """What defines a run but for its seeds, by name."""
+    values = defining(config.record())
+    return {name: value for name, value in values.items() if name not in SEEDS}
+
+
 def differences(configs: Sequence[TrainConfig]) -> dict[str, list[Any]]:
     """Options that differ between configurations, and their values."""
-    names = (field.name for field in dataclasses.fields(TrainConfig))
-    values = {
-        name: [getattr(config, name) for config in configs]
-        for name in names
-        if name not in NOT_DEFINING
-    }
+    found = [settings(config) for config in configs]
+    names = dict.fromkeys(name for each in found for name in each)
+    values = {name: [each.get(name) for each in found] for name in names}
     return {name: each for name, each in values.items() if len(set(each)) > 1}
 
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import dataclasses
 from typing import Any
 
-from envs import options as _options
 from envs.base import ArmEnv as ArmEnv
 from envs.door import Door
+from envs.options import Options as Options
 from envs.push import Push
 from envs.trajectory import Trajectory
 from envs.types import State as State
 from rmp_mjx.names import unknown
+from rmp_mjx.robot import Robot
 
-ENVS: dict[str, type[ArmEnv]] = {task.name: task for task in (Trajectory, Door, Push)}
+ENVS: dict[str, type[ArmEnv]] = {
+    task.Options.env: task for task in (Trajectory, Door, Push)
+}
 """Tasks by name."""
 
 
@@ -22,31 +25,66 @@ def names() -> tuple[str, ...]:
     return tuple(ENVS)
 
 
-def load(name: str, **options: Any) -> ArmEnv:
-    """Make a task.
+def make_options(env: str, **options: Any) -> Options:
+    """The options of a task, checked; builds nothing.
 
     Args:
-        name: One of `names()`.
+        env: One of `names()`.
         **options: Fields of the task's options, for instance `controller`, `physics`,
             `obstacles`; see `envs.options.Options` and the task's module.
 
     Raises:
         ValueError: Unknown task, option, or value; the message lists the valid ones.
     """
-    task = _task(name)
-    return task(_options.make(task.Options, name, options))
+    kind = task(env).Options
+    valid = [field.name for field in dataclasses.fields(kind)]
+    for name in options:
+        if name not in valid:
+            raise ValueError(unknown(f"option of '{env}'", name, valid))
+    return kind(**options)
 
 
-def parse_options(name: str, texts: Iterable[str]) -> dict[str, Any]:
-    """Options for `load` from texts such as `layout=close`; builds nothing.
+def make(
+    options: Options, robot: Robot | None = None, controller: Any = None
+) -> ArmEnv:
+    """Make the task that the options describe.
+
+    Args:
+        options: Options of the task.
+        robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
+        controller: A controller object instead of the options' named one.
+    """
+    return task(options.env)(options, robot, controller)
+
+
+def load(
+    name: str, *, robot: Robot | None = None, controller: Any = None, **options: Any
+) -> ArmEnv:
+    """Make a task by name.
+
+    Args:
+        name: One of `names()`.
+        robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
+        controller: Name of a controller, or a controller object.
+        **options: More of the task's options, as in `make_options`.
 
     Raises:
         ValueError: Unknown task, option, or value; the message lists the valid ones.
     """
-    task = _task(name)
-    options = _options.parse(task.Options, name, texts)
-    _options.make(task.Options, name, options)
-    return options
+    if isinstance(controller, str):
+        options["controller"], controller = controller, None
+    return make(make_options(name, **options), robot, controller)
+
+
+def task(name: str) -> type[ArmEnv]:
+    """The class of a task.
+
+    Raises:
+        ValueError: Unknown task; the message lists the valid ones.
+    """
+    if name not in ENVS:
+        raise ValueError(unknown("env", name, names()))
+    return ENVS[name]
 
 
 def describe(name: str, **options: Any) -> str:
@@ -62,9 +100,3 @@ def describe(name: str, **options: Any) -> str:
         for row in rows
     )
     return "\n".join(lines)
-
-
-def _task(name: str) -> type[ArmEnv]:
-    if name not in ENVS:
-        raise ValueError(unknown("env", name, names()))
-    return ENVS[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from rmp_mjx.robot.kinematics import (
     site_state,
 )
 from rmp_mjx.shapes import Gap
-from rmp_mjx.sim import PhysicsState, load_physics
+from rmp_mjx.sim import ENGINES, PhysicsState, load_physics
 from rmp_mjx.types import Setpoint
 from rmp_mjx.vec import Vec
 
@@ -49,8 +49,6 @@ class ArmEnv(abc.ABC):
 
     Options: ClassVar[type[options.Options]] = options.Options
     """The task's options."""
-    name: ClassVar[str]
-    """The task's name."""
     q_start: ClassVar[np.ndarray]
     """Start configuration of the Jaco 2, (7,) [rad]."""
     sphere_box: ClassVar[tuple[np.ndarray, np.ndarray]]
@@ -60,17 +58,26 @@ class ArmEnv(abc.ABC):
     fixture_slots: ClassVar[dict[str, int]] = {}
     """Obstacle slots that `fixtures` fills, by kind, besides the table's plane."""
 
-    def __init__(self, asked: options.Options):
-        """Put the pieces together."""
+    def __init__(
+        self,
+        asked: options.Options,
+        robot: Robot | None = None,
+        controller: Any = None,
+    ):
+        """Put the pieces together.
+
+        Args:
+            asked: Options.
+            robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
+            controller: A controller object instead of the options' named one.
+        """
         self.options = asked
-        robot = asked.robot
         if robot is None:
             # The posture leaf rests where the task starts.
             robot = Robot.load("jaco2", armature=asked.armature)
             robot = robot.replace(q_home=self.q_start)
-        controller = asked.controller
-        if isinstance(controller, str):
-            controller = options.CONTROLLERS[controller](robot)
+        if controller is None:
+            controller = options.CONTROLLERS[asked.controller](robot)
             leaves = self.collision_leaves(robot)
             if asked.controller == "rmp_vices" and leaves:
                 controller = controller.replace(collision=leaves)
@@ -138,6 +145,17 @@ class ArmEnv(abc.ABC):
         return slots
 
     # What all tasks share.
+
+    @property
+    def name(self) -> str:
+        """The task's name."""
+        return self.options.env
+
+    @property
+    def engine(self) -> str:
+        """Physics engine, timestep and friction cone, in words."""
+        name = next(n for n, kind in ENGINES.items() if isinstance(self.physics, kind))
+        return f"{name}, {1e3 * self.sim_dt:g} ms, {self.options.cone}"
 
     @property
     def entries(self) -> tuple[Entry, ...]:

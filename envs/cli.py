@@ -1,126 +1,92 @@
-"""Command-line parsing for the entry points."""
+"""The command lines of `train.py` and `eval.py`."""
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Generic, Literal
 
 import tyro
 
+import envs
+from envs.flags import (
+    DEFAULT,
+    EnvName,
+    Task,
+    TrainOptions,
+    from_record,
+    load_config,
+    named,
+    parse,
+    train_flags,
+)
 from envs.grid import GRID, Grid, load_grid, open_grid
-from rmp_mjx.training.config import ConfigError, TrainConfig, load_config
+from envs.options import Options
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.runs.checkpoint import NEWEST
-from rmp_mjx.training.runs.run_folder import CONFIG
-
-Options = TypeVar("Options")
 
 
-def parse(kind: type[Options], args: Sequence[str] | None, default=None) -> Options:
-    """Parse options into a dataclass; `--num_envs` and `--num-envs` are the same.
+def make_config(env: str = DEFAULT, **options: Any) -> TrainConfig:
+    """A training configuration from flat names, each of its task, learning or run.
 
-    Exits with code 2 and a message where the options are wrong.
+    Args:
+        env: Name of the task.
+        **options: For instance `controller`, `obstacles`, `num_envs`, `run_dir`.
+
+    Raises:
+        ValueError: Unknown task, option or value; the message lists the valid ones.
     """
-    if default is None:
-        return tyro.cli(kind, args=args, use_underscores=True)
-    return tyro.cli(kind, args=args, default=default, use_underscores=True)
+    return TrainConfig(envs.make_options(env)).replace(**options)
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainOptions(TrainConfig):
-    """Train a policy with PPO (Schulman et al., 2017), or a grid of policies."""
-
-    envs: str | None = None
-    """Tasks of a grid, joined by commas: one run for each of them and each of
-    `controllers`, one after the other."""
-    controllers: str | None = None
-    """Controllers of a grid, joined by commas."""
-    coordinator: str | None = None
-    """HOST:PORT of process 0, where several processes train together; under Slurm's
-    srun this and the next two are found out."""
-    process_id: int | None = None
-    """Number of this process, from 0."""
-    num_processes: int | None = None
-    """Number of processes."""
-
-    @property
-    def config(self) -> TrainConfig:
-        """The options of a run."""
-        fields = dataclasses.fields(TrainConfig)
-        return TrainConfig(**{f.name: getattr(self, f.name) for f in fields})
-
-    @property
-    def grid(self) -> Grid | None:
-        """The grid that is asked for, if one is."""
-        if not self.envs and not self.controllers:
-            return None
-        envs = tuple((self.envs or self.env).split(","))
-        controllers = tuple((self.controllers or self.controller).split(","))
-        return open_grid(self.config, envs, controllers)
-
-
-def parse_train(args: Sequence[str] | None = None) -> TrainOptions:
+def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid | None]:
     """Parse the options of a training run or of a grid.
 
     With `--resume RUN` the defaults are those that RUN was started with.
 
+    Returns:
+        The options, and the grid if one is asked for.
+
     Raises:
-        ConfigError: RUN is no run folder.
+        ValueError: RUN is no run folder, or a name or value is none.
     """
-    options = parse(TrainOptions, args)
-    if not options.resume:
-        return options
-    folder, saved = Path(options.resume), {}
-    if (folder / GRID).exists():
-        base, envs, controllers = load_grid(folder)
-        saved = {"envs": ",".join(envs), "controllers": ",".join(controllers)}
-    else:
-        base = load_config(folder / CONFIG)
-    default: dict[str, Any] = {**dataclasses.asdict(base), **saved}
-    default |= {"resume": None, "run_dir": None}
-    default |= {"overwrite": False, "allow_changes": False}
-    return parse(TrainOptions, args, TrainOptions(**default))
+    given = named(args, "env", "envs", "controllers", "resume")
+    saved: dict[str, TrainConfig] = {}
+    controllers, tasks = given["controllers"], given["envs"]
+    if given["resume"]:
+        folder = Path(given["resume"])
+        if (folder / GRID).exists():
+            records, those = load_grid(folder)
+            saved = {name: from_record(each) for name, each in records.items()}
+            controllers = controllers or ",".join(those)
+            tasks = tasks or ",".join(saved)
+        else:
+            config = load_config(folder)
+            saved = {config.task.env: config}
+    names = (tasks or given["env"] or next(iter(saved), DEFAULT)).split(",")
+    found = [train_flags(name, args, saved.get(name)) for name in names]
+    if not tasks and not controllers:
+        return found[0], None
+    configs = {name: options.config for name, options in zip(names, found, strict=True)}
+    chosen = tuple((controllers or found[0].task.controller).split(","))
+    return found[0], open_grid(configs, chosen)
 
 
-REFERENCE = {"mujoco": ("sim_dt=0.002", "cone=elliptic"), "mjx": (), "warp": ()}
+REFERENCE = {"mujoco": {"sim_dt": 0.002, "cone": "elliptic"}, "mjx": {}, "warp": {}}
 """Second physics engines, and the task's options that go with them."""
-
-SHORTHANDS = (
-    "obstacles",
-    "layout",
-    "obstacle_speed",
-    "obstacle_noise",
-    "obstacle_delay",
-    "terminate_on_event",
-)
-"""Options of `EvalConfig` that are options of the task."""
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalConfig:
+class EvalOptions(Generic[Task]):
     """Evaluate the policy of a run, or a trivial agent for comparison."""
 
+    task: Task
+    """Options of the task; default: the run's."""
     run: str | None = None
     """Run folder whose newest policy is evaluated."""
     agent: Literal["policy", "zero", "random"] = "policy"
     """policy (needs run), or zero or random actions."""
-    env: str | None = None
-    """Task; default: the run's, or trajectory."""
-    controller: str | None = None
-    """Low-level controller; default: the run's, or rmp_vices."""
-    obstacles: int | None = None
-    """Random spheres in every episode; this and the next five: default the run's."""
-    layout: str | None = None
-    """How near the spheres may be at the start: far or close."""
-    obstacle_speed: float | None = None
-    """Speed of the spheres [m/s]."""
-    obstacle_noise: float | None = None
-    """Standard deviation of their measured positions [m]."""
-    obstacle_delay: float | None = None
-    """Age of their measured positions [s]."""
-    terminate_on_event: bool | None = None
-    """Whether a collision or joint-limit event ends the episode."""
-    env_options: tuple[str, ...] = ()
-    """Further options of the task as NAME=VALUE; they add to the run's."""
+    env: EnvName = DEFAULT
+    """Task; default: the run's. Its own options are below."""
     physics: Literal["mujoco", "mjx", "warp"] | None = None
     """A second physics engine, where the same policy meets the same starts; mujoco: the
     C engine with 2 ms steps and elliptic friction cones."""
@@ -141,42 +107,71 @@ class EvalConfig:
     """Folder for the results; default: the run's folder, or one under runs/ named
     after agent, task and controller."""
 
-    def resolve(self) -> tuple[list[TrainConfig], Path]:
-        """Fill in what the run says.
-
-        Returns:
-            The configuration to load the task and the policy with, then, where one
-            is asked for, that of the second physics engine; and the folder for
-            results.
+    def __post_init__(self):
+        """Check the values.
 
         Raises:
-            ConfigError: The options contradict each other, or run is no run folder.
+            ConfigError: Nothing is evaluated so.
         """
         if self.episodes < 1:
             raise ConfigError(f"episodes must be at least 1, is {self.episodes}")
-        if (self.run is None) == (self.agent == "policy"):
-            raise ConfigError("give either --run RUN or --agent zero|random")
-        base = load_config(Path(self.run) / CONFIG) if self.run else TrainConfig()
-        if not 0 <= self.seed_index < base.num_seeds:
-            raise ConfigError(
-                f"seed_index must lie in 0 .. {base.num_seeds - 1}, the agents of the "
-                f"run; is {self.seed_index}"
-            )
-        asked = [(name, getattr(self, name)) for name in SHORTHANDS]
-        given = tuple(f"{name}={value}" for name, value in asked if value is not None)
-        config = dataclasses.replace(
-            base,
-            resume=None,
-            env=self.env or base.env,
-            controller=self.controller or base.controller,
-            env_options=base.env_options + self.env_options + given,
-        )
-        configs = [config]
+
+    @property
+    def tasks(self) -> list[Options]:
+        """The task, then, where one is asked for, the one of the second engine."""
+        tasks: list[Options] = [self.task]
         if self.physics:
-            options = config.env_options + REFERENCE[self.physics]
-            configs.append(
-                dataclasses.replace(config, physics=self.physics, env_options=options)
-            )
-        name = f"{self.agent}-{config.env}-{config.controller}"
-        out = self.out or self.run or f"runs/{name}"
-        return configs, Path(out)
+            other = REFERENCE[self.physics] | {"physics": self.physics}
+            tasks.append(dataclasses.replace(self.task, **other))
+        return tasks
+
+    @property
+    def folder(self) -> Path:
+        """Folder for the results."""
+        name = f"{self.agent}-{self.task.env}-{self.task.controller}"
+        return Path(self.out or self.run or f"runs/{name}")
+
+
+def parse_eval(
+    args: Sequence[str] | None = None,
+) -> tuple[EvalOptions, TrainConfig | None]:
+    """Parse the options of an evaluation.
+
+    Returns:
+        The options, and what the run was trained with, if there is one.
+
+    Raises:
+        ValueError: The options contradict each other, a name or value is none, or run
+            is no run folder.
+    """
+    given = named(args, "env", "run")
+    config = load_config(Path(given["run"])) if given["run"] else None
+    env = given["env"] or (config.task.env if config else DEFAULT)
+    task = envs.make_options(env)
+    if config and config.task.env == env:
+        task = config.task
+    elif config:
+        task = dataclasses.replace(task, controller=config.task.controller)
+    # `--physics` is the second engine here, so the task's own is no flag.
+    shown = _without_physics(type(task))
+    default = EvalOptions(shown(**vars(task)), env=env)
+    options = parse(EvalOptions[shown], args, default, env)
+    options = dataclasses.replace(options, task=type(task)(**vars(options.task)))
+    if (options.run is None) == (options.agent == "policy"):
+        raise ConfigError("give either --run RUN or --agent zero|random")
+    seeds = config.ppo.num_seeds if config else 1
+    if not 0 <= options.seed_index < seeds:
+        raise ConfigError(
+            f"seed_index must lie in 0 .. {seeds - 1}, the agents of the run; is "
+            f"{options.seed_index}"
+        )
+    return options, config
+
+
+def _without_physics(kind: type[Options]) -> type[Options]:
+    """The options of a task, the physics engine being no flag."""
+    hidden = ("physics", tyro.conf.Suppress[str], dataclasses.field(default="auto"))
+    same = {"__doc__": kind.__doc__, "__module__": kind.__module__}
+    return dataclasses.make_dataclass(
+        kind.__name__, [hidden], bases=(kind,), frozen=True, namespace=same
+    )

@@ -4,7 +4,6 @@ A grid's folder has a run folder for every cell and `grid.json`: what was asked 
 which cells have finished. A grid that was interrupted goes on where it stopped.
 """
 
-import dataclasses
 import itertools
 import json
 import time
@@ -19,7 +18,6 @@ from rmp_mjx.files import write_text
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
-    config_of,
 )
 from rmp_mjx.training.runs import distributed, run_folder
 
@@ -34,10 +32,8 @@ class Grid:
 
     folder: Path
     """Folder of the grid."""
-    base: TrainConfig
-    """What all cells share."""
-    envs: tuple[str, ...]
-    """Tasks."""
+    configs: dict[str, TrainConfig]
+    """What the cells of each task share."""
     controllers: tuple[str, ...]
     """Controllers."""
 
@@ -45,15 +41,13 @@ class Grid:
         """Configurations by the name of their cell, new ones or to be resumed."""
         return {
             f"{env}-{controller}": self._cell(env, controller)
-            for env, controller in itertools.product(self.envs, self.controllers)
+            for env, controller in itertools.product(self.configs, self.controllers)
         }
 
     def _cell(self, env: str, controller: str) -> TrainConfig:
         folder = self.folder / f"{env}-{controller}"
         begun = (folder / run_folder.CONFIG).exists()
-        return dataclasses.replace(
-            self.base,
-            env=env,
+        return self.configs[env].replace(
             controller=controller,
             run_dir=None if begun else str(folder),
             resume=str(folder) if begun else None,
@@ -68,20 +62,19 @@ class Grid:
     def save(self, finished: dict[str, Any]) -> None:
         """Write `grid.json`."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        base = dataclasses.replace(
-            self.base, run_dir=None, resume=None, overwrite=False
-        )
         document = {
-            "config": dataclasses.asdict(base),
-            "envs": self.envs,
+            "configs": {
+                env: config.replace(run_dir=None, resume=None, overwrite=False).record()
+                for env, config in self.configs.items()
+            },
             "controllers": self.controllers,
             "finished": finished,
         }
         write_text(self.folder / GRID, json.dumps(document, indent=2) + "\n")
 
 
-def load_grid(folder: Path) -> tuple[TrainConfig, tuple[str, ...], tuple[str, ...]]:
-    """What a grid was started with: shared options, tasks, controllers.
+def load_grid(folder: Path) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
+    """What a grid was started with: records of its tasks' configurations, controllers.
 
     Raises:
         ConfigError: `grid.json` cannot be read.
@@ -89,30 +82,30 @@ def load_grid(folder: Path) -> tuple[TrainConfig, tuple[str, ...], tuple[str, ..
     path = folder / GRID
     try:
         saved = json.loads(path.read_text())
-        names = tuple(saved["envs"]), tuple(saved["controllers"])
-        return config_of(saved["config"]), *names
+        if "config" in saved:  # of version 0.1
+            saved["configs"] = {e: saved["config"] | {"env": e} for e in saved["envs"]}
+        return dict(saved["configs"]), tuple(saved["controllers"])
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ConfigError(f"{path} cannot be read as a grid: {error}") from error
 
 
-def open_grid(
-    config: TrainConfig, envs: tuple[str, ...], controllers: tuple[str, ...]
-) -> Grid:
+def open_grid(configs: dict[str, TrainConfig], controllers: tuple[str, ...]) -> Grid:
     """The grid that the options name: a new one, or with `resume` the one there.
 
     Raises:
         ConfigError: Its folder is in use, or `resume` names no grid.
     """
-    if config.resume:
-        folder = Path(config.resume)
+    run = next(iter(configs.values())).run
+    if run.resume:
+        folder = Path(run.resume)
     else:
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        folder = Path(config.run_dir or f"runs/grid-{stamp}")
+        folder = Path(run.run_dir or f"runs/grid-{stamp}")
         if folder.exists() and any(folder.iterdir()):
             raise ConfigError(
                 f"{folder} is not empty: --resume {folder} continues that grid"
             )
-    return Grid(folder, config, envs, controllers)
+    return Grid(folder, configs, controllers)
 
 
 def run(grid: Grid, train: Callable[[TrainConfig], int], console: Console) -> int:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from envs.placement import LAYOUTS
+from envs.placement import Layout
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.osc import OSC
 from rmp_mjx.names import unknown
-from rmp_mjx.robot import Robot
+
+ControllerName = Literal["rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf"]
 
 CONTROLLERS = {
     "rmp_vices": RMPVICES,
@@ -27,9 +27,6 @@ CONTROLLERS = {
 CTRL_DT = 0.05
 """Seconds per policy step."""
 
-CONES = ("pyramidal", "elliptic")
-"""MuJoCo's friction cones."""
-
 _AT_LEAST_ZERO = (
     "obstacles",
     "obstacle_speed",
@@ -41,26 +38,33 @@ _AT_LEAST_ZERO = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of every task; a task adds its own in a subclass."""
+    """Options of every task; a task adds its own in a subclass.
 
-    controller: Any = "rmp_vices"
-    """A name in `CONTROLLERS`, or a controller object."""
-    physics: str = "auto"
-    """`auto`, `mujoco` (C engine), `mjx` or `warp` (MuJoCo Warp)."""
-    armature: str = "physical"
-    """Rotor inertias of the Jaco 2: `physical` or `robosuite`."""
-    robot: Robot | None = None
-    """An arm of your own instead; it starts at its `q_home`."""
+    They are flags of the command line, too: an option that takes one of a few names is
+    a `Literal`.
+    """
+
+    env: ClassVar[str]
+    """Name of the task."""
+    controller: ControllerName = "rmp_vices"
+    """Low-level controller that the policy commands: rmp_vices, vices,
+    rmp_vices_literal (the paper's formulas with their signs corrected), osc (vices with
+    a fixed impedance), or vices_cbf (vices behind a safety filter)."""
+    physics: Literal["auto", "mujoco", "mjx", "warp"] = "auto"
+    """Physics engine: mujoco (C threads), mjx (JAX), warp (MuJoCo Warp; extra `warp`),
+    or auto: mujoco on a CPU, else mjx."""
+    armature: Literal["physical", "robosuite"] = "physical"
+    """Rotor inertias of the Jaco 2."""
     sim_dt: float = 0.005
     """Physics and control timestep [s]; must divide 0.05 s."""
-    cone: str = "pyramidal"
-    """Friction cone: `pyramidal` or `elliptic`."""
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    """MuJoCo's friction cone."""
     obstacles: int = 0
     """Random spheres, new in every episode."""
     sphere_radius: float = 0.05
     """Their radius [m]."""
-    layout: str = "far"
-    """Their clearances at the start, `far` or `close`."""
+    layout: Layout = "far"
+    """How near they may be at the start."""
     obstacle_speed: float = 0.0
     """Speed of the spheres, each in a random direction [m/s]."""
     obstacle_noise: float = 0.0
@@ -75,7 +79,7 @@ class Options:
     terminate_on_success: bool = False
     """Whether solving the task ends the episode."""
     episode_length: int = 1024
-    """Policy steps until the time limit, which the caller enforces."""
+    """Policy steps until the time limit."""
     start_noise: float = 0.02
     """Standard deviation of the start configuration [rad]."""
 
@@ -85,11 +89,11 @@ class Options:
         Raises:
             ValueError: An option has no such value; the message lists the valid ones.
         """
-        if isinstance(self.controller, str):
-            self._check("controller", tuple(CONTROLLERS))
+        for name, hint in get_type_hints(type(self)).items():
+            value = getattr(self, name, None)
+            if get_origin(hint) is Literal and value not in get_args(hint):
+                raise ValueError(unknown(name, str(value), get_args(hint)))
         substeps(self.sim_dt)
-        self._check("cone", CONES)
-        self._check("layout", tuple(LAYOUTS))
         for name in _AT_LEAST_ZERO:
             if not getattr(self, name) >= 0:
                 raise ValueError(
@@ -104,9 +108,26 @@ class Options:
                 f"sphere_radius must be positive, got {self.sphere_radius}"
             )
 
-    def _check(self, name: str, valid: tuple[str, ...]) -> None:
-        if getattr(self, name) not in valid:
-            raise ValueError(unknown(name, getattr(self, name), valid))
+    @property
+    def title(self) -> str:
+        """Task and controller, for figures and folder names."""
+        return f"{self.env}, {self.controller}"
+
+    @property
+    def spheres(self) -> str:
+        """The obstacles in words."""
+        if not self.obstacles:
+            return "no obstacles"
+        extra = [
+            f", {name} {value:g}"
+            for name in ("speed", "noise", "delay")
+            if (value := getattr(self, f"obstacle_{name}"))
+        ]
+        return f"{self.obstacles} spheres ({self.layout}{''.join(extra)})"
+
+    def record(self) -> dict[str, Any]:
+        """The options by name, `env` first, JSON-ready."""
+        return {"env": self.env, **dataclasses.asdict(self)}
 
 
 def substeps(sim_dt: float) -> int:
@@ -123,49 +144,3 @@ def substeps(sim_dt: float) -> int:
             f"sim_dt={sim_dt} s does not divide the policy step of {CTRL_DT} s"
         )
     return n
-
-
-def make(kind: type[Options], task: str, options: Mapping[str, Any]) -> Options:
-    """A task's options from keyword arguments.
-
-    Raises:
-        ValueError: Unknown option or value; the message lists the valid ones.
-    """
-    valid = [field.name for field in dataclasses.fields(kind)]
-    for name in options:
-        if name not in valid:
-            raise ValueError(unknown(f"option of '{task}'", name, valid))
-    return kind(**options)
-
-
-def parse(kind: type[Options], task: str, texts: Iterable[str]) -> dict[str, Any]:
-    """Option values from texts like `layout=close`, each of its option's type.
-
-    Raises:
-        ValueError: Not of the form NAME=VALUE, an unknown option, or not its type.
-    """
-    defaults = {
-        field.name: field.default
-        for field in dataclasses.fields(kind)
-        if isinstance(field.default, (bool, int, float, str))
-    }
-    values = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise ValueError(f"an option reads NAME=VALUE, got '{text}'")
-        if name not in defaults:
-            raise ValueError(unknown(f"option of '{task}'", name, tuple(defaults)))
-        values[name] = _convert(name, value, type(defaults[name]))
-    return values
-
-
-def _convert(name: str, text: str, kind: type) -> Any:
-    if kind is bool:
-        if text.lower() not in ("true", "false"):
-            raise ValueError(f"{name} must be true or false, got '{text}'")
-        return text.lower() == "true"
-    try:
-        return kind(text)
-    except ValueError as error:
-        raise ValueError(f"{name} must be a {kind.__name__}, got '{text}'") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -11,7 +13,9 @@ from rmp_mjx.types import Constant
 CANDIDATES = 64
 """Placements drawn at once; the first valid one is used."""
 
-LAYOUTS = {
+Layout = Literal["far", "close"]
+
+LAYOUTS: dict[Layout, dict[str, Any]] = {
     "far": {"points": ("surface", 0.08), "arm": 0.08},
     "close": {"points": ("center", 0.08), "arm": 0.03},
 }
@@ -44,7 +48,7 @@ def place_spheres(
     rng: Array,
     count: int,
     radius: float,
-    layout: str,
+    layout: Layout,
     low: Float[Constant, " 3"],
     high: Float[Constant, " 3"],
     points: Float[Array, "v 3"],

@@ -52,6 +52,7 @@ NEAREST_GOAL, FARTHEST_GOAL = 0.10, 0.25
 class PushOptions(options.Options):
     """Options of block pushing."""
 
+    env: ClassVar[str] = "push"
     episode_length: int = 256
     """Policy steps until the time limit; the paper's is 1024."""
     block_mass: float = 0.3
@@ -80,7 +81,6 @@ class Push(ArmEnv):
     """
 
     Options = PushOptions
-    name = "push"
     q_start = np.array([3.152, 3.878, -0.009, 1.317, 0.065, 3.708, 3.147])
     sphere_box = (np.array([0.32, -0.28, -0.05]), np.array([0.60, 0.28, 0.20]))
     task_metrics: ClassVar[dict[str, str]] = {"goal_distance": "last"}

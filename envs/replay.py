@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 import envs
+from envs.flags import from_record
 from rmp_mjx import runtime
-from rmp_mjx.training.config import config_of
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.rollout import VALUE_LIMIT
 from rmp_mjx.training.runs import run_folder
@@ -171,13 +171,8 @@ def read(path: Path) -> tuple[envs.ArmEnv, envs.State, np.ndarray, dict[str, Any
         ValueError: It is no such file, or of another task.
     """
     about = faults.about(path)
-    config = config_of(about["config"])
-    env = envs.load(
-        config.env,
-        controller=config.controller,
-        physics="mujoco",
-        **envs.parse_options(config.env, config.env_options),
-    )
+    config = from_record(about["config"])
+    env = envs.make(config.replace(physics="mujoco").task)
     template = jax.eval_shape(env.reset, jax.random.key(0))
     state, action = faults.load(path, template)
     return env, state, action, about

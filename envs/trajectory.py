@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,23 +21,17 @@ BOX_LOW = np.array([0.30, -0.20, 0.03])
 BOX_HIGH = np.array([0.55, 0.20, 0.28])
 """Corners of the via points' box in the arm's base frame [m]."""
 
-OBSERVATIONS = ("rotated", "fixed")
-
 
 @dataclasses.dataclass(frozen=True)
 class TrajectoryOptions(options.Options):
     """Options of trajectory following."""
 
+    env: ClassVar[str] = "trajectory"
     terminate_on_success: bool = True
     """Whether the last via point ends the episode."""
-    observation: str = "rotated"
-    """`rotated`: vectors to the via points, the current one first; `fixed`: the paper's
+    observation: Literal["rotated", "fixed"] = "rotated"
+    """rotated: vectors to the via points, the current one first; fixed: the paper's
     list of positions and checked flags."""
-
-    def __post_init__(self):
-        """Check the values."""
-        super().__post_init__()
-        self._check("observation", OBSERVATIONS)
 
 
 class Trajectory(ArmEnv):
@@ -48,7 +42,6 @@ class Trajectory(ArmEnv):
     """
 
     Options = TrajectoryOptions
-    name = "trajectory"
     q_start = np.array([3.192, 3.680, 0.0, 1.170, 0.050, 3.760, 3.142])
     sphere_box = (BOX_LOW, BOX_HIGH)
     task_metrics: ClassVar[dict[str, str]] = {"via_points": "sum"}

@@ -1,14 +1,14 @@
 """`eval.py`: a run's policy and trivial agents, on a toy task."""
 
+import dataclasses
 import importlib
 import json
-import types
 
 import polars as pl
 import pytest
 
 import envs
-from tests.training import toys
+from tests import toy_task
 from tests.training.conftest import run
 
 WANTED = (
@@ -23,27 +23,14 @@ WANTED = (
 
 
 @pytest.fixture
-def asked():
-    """Options that tasks were loaded with."""
-    return []
+def asked(monkeypatch):
+    """Options that tasks were made with."""
+    return toy_task.register(monkeypatch)
 
 
 @pytest.fixture
-def evaluate(monkeypatch, asked):
-    def load(name, **options):
-        asked.append(options)
-        return toys.Counter(physics=options["physics"])
-
-    module = importlib.import_module("eval")
-    fake = types.SimpleNamespace(
-        names=lambda: ("counter", "trajectory"),
-        load=load,
-        parse_options=lambda name, texts: dict(text.split("=") for text in texts),
-    )
-    monkeypatch.setattr(module, "envs", fake)
-    monkeypatch.setattr(module, "engine", lambda env: env.physics)
-    monkeypatch.setattr(module, "spheres", lambda env: "2 balls")
-    return module.main
+def evaluate(asked):
+    return importlib.import_module("eval").main
 
 
 def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):
@@ -57,7 +44,7 @@ def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):
     assert (found["training_iterations"], found["engine"]) == (4, "auto")
     assert "reference" not in found
     said = capsys.readouterr().out
-    assert "policy agent, counter, rmp_vices, 2 balls, 9 episodes" in said
+    assert "policy agent, counter, rmp_vices, no obstacles, 9 episodes" in said
     assert "return, mean +- sd" in said
     for name in ("contact_forces.png", "clearances.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
@@ -66,27 +53,35 @@ def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):
     assert json.loads((folder / "eval.json").read_text()) == found
 
 
-def test_options_of_the_task_add_to_the_runs(evaluate, asked, tmp_path):
+def test_options_of_the_task_override_the_runs(evaluate, asked, tmp_path):
     folder = tmp_path / "run"
-    run(folder, env_options=("variant=heavy", "layout=far"))
+    task = toy_task.CounterOptions(variant="heavy", layout="far", obstacle_noise=0.01)
+    run(folder, task=task)
     options = ["--run", str(folder), "--out", str(tmp_path / "out"), "--no-video"]
     options += ["--episodes", "4", "--obstacles", "2", "--layout", "close"]
-    options += ["--obstacle_speed", "0.1", "--terminate_on_event", "False"]
+    options += ["--obstacle_speed", "0.1", "--no_terminate_on_event"]
     assert evaluate(options) == 0
-    wanted = {"variant": "heavy", "layout": "close", "obstacles": "2"}
-    wanted |= {"obstacle_speed": "0.1", "terminate_on_event": "False"}
+    wanted = dataclasses.replace(
+        task,
+        obstacles=2,
+        layout="close",
+        obstacle_speed=0.1,
+        terminate_on_event=False,
+    )
     found = json.loads((tmp_path / "out" / "eval.json").read_text())
-    assert found["env_options"] == wanted
-    assert wanted.items() <= asked[0].items()
+    assert found["task"] == wanted.record()
+    assert asked == [wanted]
 
 
 def test_a_second_engine_gives_a_second_column(evaluate, asked, tmp_path, capsys):
     options = ["--agent", "zero", "--env", "counter", "--out", str(tmp_path)]
     options += ["--episodes", "5", "--physics", "mujoco", "--no-video"]
     assert evaluate(options) == 0
-    assert [task["physics"] for task in asked] == ["auto", "mujoco"]
-    assert {"sim_dt": "0.002", "cone": "elliptic"}.items() <= asked[1].items()
-    assert "sim_dt" not in asked[0]
+    assert [task.physics for task in asked] == ["auto", "mujoco"]
+    assert asked[1] == dataclasses.replace(
+        asked[0], physics="mujoco", sim_dt=0.002, cone="elliptic"
+    )
+    assert asked[0].sim_dt == 0.005
     found = json.loads((tmp_path / "eval.json").read_text())
     assert (found["engine"], found["reference"]["engine"]) == ("auto", "mujoco")
     # The toy knows no engines: the same starts must give the same values.
@@ -106,15 +101,14 @@ def test_a_task_that_cannot_be_drawn_says_so_in_one_line(evaluate, tmp_path, cap
 
 
 def test_the_title_says_what_is_simulated_and_where():
-    module = importlib.import_module("eval")
     env = envs.load("trajectory", physics="mujoco")
-    assert module.engine(env) == "mujoco, 5 ms, pyramidal"
-    assert module.spheres(env) == "no obstacles"
+    assert env.engine == "mujoco, 5 ms, pyramidal"
+    assert env.options.spheres == "no obstacles"
     env = envs.load(
         "trajectory", physics="mjx", obstacles=2, layout="close", obstacle_delay=0.1
     )
-    assert module.engine(env) == "mjx, 5 ms, pyramidal"
-    assert module.spheres(env) == "2 spheres (close, delay 0.1)"
+    assert env.engine == "mjx, 5 ms, pyramidal"
+    assert env.options.spheres == "2 spheres (close, delay 0.1)"
 
 
 @pytest.mark.parametrize("agent", ["zero", "random"])
@@ -132,14 +126,40 @@ def test_an_agent_needs_no_run(evaluate, tmp_path, agent):
         [],
         ["--run", "/nonexistent"],
         ["--agent", "zero", "--env", "nowhere"],
-        ["--agent", "zero", "--episodes", "0"],
-        ["--agent", "zero", "--env_options", "controller=vices"],
-        ["--agent", "zero", "--env_options", "obstacles"],
+        ["--agent", "zero", "--env_options", "obstacles=2"],
     ],
 )
 def test_wrong_options_exit_with_code_2(evaluate, options, capsys):
     assert evaluate(options) == 2
     assert capsys.readouterr().err.startswith("error: ")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--episodes", "0"], "episodes must be at least 1"),
+        (["--obstacle", "2"], "--obstacles"),
+        (["--layout", "near"], "('far', 'close')"),
+        (["--physics", "auto"], "'mjx'"),
+    ],
+)
+def test_wrong_flags_exit_with_code_2_and_the_valid_ones(
+    evaluate, options, message, capsys
+):
+    with pytest.raises(SystemExit) as stop:
+        evaluate(["--agent", "zero", *options])
+    assert stop.value.code == 2
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert message in said
+
+
+def test_help_lists_the_options_of_the_task(evaluate, capsys):
+    with pytest.raises(SystemExit) as stop:
+        evaluate(["--env", "push", "--agent", "zero", "--help"])
+    assert stop.value.code == 0
+    said = capsys.readouterr().out
+    assert "--block_mass" in said and "--variant" not in said
+    assert said.count("--physics") == 1  # the second engine's
 
 
 def test_a_run_without_checkpoints_exits_with_code_1(evaluate, tmp_path, capsys):

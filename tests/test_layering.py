@@ -47,7 +47,8 @@ TRAINING = {
 }
 TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}
 KNOW_MUJOCO = {"robot", "sim"}
-COMMAND_LINE = {"envs.cli", "envs.grid", "envs.replay"}  # where tasks and training meet
+# where tasks and training meet
+COMMAND_LINE = {"envs.cli", "envs.flags", "envs.grid", "envs.replay"}
 
 
 def modules(package: str) -> list[Path]:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import envs
-from rmp_mjx.training.config import load_config
-from rmp_mjx.training.runs import run_folder
+from envs.flags import load_config
 from rmp_mjx.training.runs.loop import load_agent
 
 FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
@@ -19,11 +18,11 @@ FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
 @pytest.mark.parametrize("task", ["trajectory", "door", "push"])
 def test_a_pretrained_policy_loads_by_its_name_and_acts(task, controller):
     run = FOLDER / f"{task}-{controller}"
-    config = load_config(run / run_folder.CONFIG)
-    assert (config.env, config.controller) == (task, controller)
+    config = load_config(run)
+    assert (config.task.env, config.task.controller) == (task, controller)
     env = envs.load(task, controller=controller)
     iterations, agent = load_agent(env, config, run, True, pytest.fail)
-    assert iterations * config.steps_per_iteration >= 1_500_000
+    assert iterations * config.ppo.steps_per_iteration >= 1_500_000
     obs = jax.random.normal(jax.random.key(0), (50, env.observation_size))
     action = agent(obs, jax.random.key(1))
     assert action.shape == (50, env.action_size)

@@ -13,7 +13,7 @@ from rich.console import Console
 from benchmarks.paper import cells, report, work
 from benchmarks.paper.cells import PRESETS, Cell
 from benchmarks.paper.store import Store
-from envs import cli
+from envs.flags import parse
 from rmp_mjx import runtime
 from rmp_mjx.training.config import ConfigError
 
@@ -44,7 +44,7 @@ class Options:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Parse, do what is missing, report; returns the exit code."""
-    options = cli.parse(Options, args)
+    options = parse(Options, args)
     preset = PRESETS[options.preset]
     place = Store(options.folder or cells.home(preset))
     own = place.folder / "page" if preset.name == "smoke" else Path("docs/results")

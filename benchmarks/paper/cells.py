@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from rmp_mjx.training.config import RESUMABLE, ConfigError, TrainConfig
+import envs
+from envs.cli import make_config
+from envs.options import Options
+from rmp_mjx.training.config import ConfigError, TrainConfig
 
 TASKS = {
     "trajectory": "trajectory following",
@@ -26,7 +31,7 @@ class Variant:
     """Its name."""
     color: str
     """Its colour in figures."""
-    env_options: tuple[str, ...] = ()
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task in training."""
 
 
@@ -37,7 +42,7 @@ VARIANTS = {
         "RMP-VICES, the paper's formulas", "rmp_vices_literal", "#d9a13b"
     ),
     "vices_penalty": Variant(
-        "VICES, penalty only", "vices", "#8064a2", ("terminate_on_event=False",)
+        "VICES, penalty only", "vices", "#8064a2", {"terminate_on_event": False}
     ),
     "osc": Variant("OSC, fixed impedance", "osc", "#7f7f7f"),
     "vices_cbf": Variant("VICES, CBF filter", "vices_cbf", "#3a9d5d"),
@@ -98,7 +103,7 @@ class Preset:
     """Seeds of the paper's variants."""
     baseline_seeds: int
     """Seeds of the baselines."""
-    training: TrainConfig
+    training: TrainConfig[Options]
     """What all cells share."""
     episodes: int
     """Episodes of the columns of the deployment table."""
@@ -106,7 +111,7 @@ class Preset:
     """Episodes of the other columns."""
     columns: tuple[str, ...]
     """Names of the columns."""
-    env_options: tuple[str, ...] = ()
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the tasks, in training and in deployment."""
 
     def cells(self, baselines: bool = False) -> list[Cell]:
@@ -121,30 +126,46 @@ class Preset:
             for variant in variants
         ]
 
-    def config(self, cell: Cell) -> TrainConfig:
+    def config(self, cell: Cell) -> TrainConfig[Options]:
         """The training of a cell."""
         variant = VARIANTS[cell.variant]
-        return dataclasses.replace(
-            self.training,
-            env=cell.task,
-            controller=variant.controller,
-            env_options=self.env_options + variant.env_options,
-            seed=cell.seed,
-        )
+        options = self.options | variant.options
+        task = envs.make_options(cell.task, controller=variant.controller, **options)
+        return self.training.replace(task=task, seed=cell.seed)
 
 
-def definition(config: TrainConfig) -> dict:
-    """The values that define a training: of equal ones, one is enough."""
-    values = dataclasses.asdict(config)
-    ignored = RESUMABLE - {"num_timesteps"}
-    return {name: value for name, value in values.items() if name not in ignored}
+def settings(preset: Preset) -> dict[str, Any]:
+    """What all trainings of a preset share, by name."""
+    config = preset.training
+    values = dataclasses.asdict(config.ppo)
+    return values | {"num_timesteps": config.run.num_timesteps}
 
 
-_PROTOCOL = TrainConfig(
+def definition(preset: Preset, cell: Cell) -> dict[str, Any]:
+    """The values that define a training: of equal ones, one is enough.
+
+    They are named as in the stored results, whose options are texts.
+    """
+    variant = VARIANTS[cell.variant]
+    task = preset.config(cell).task
+    return settings(preset) | {
+        "env": task.env,
+        "controller": task.controller,
+        "physics": task.physics,
+        "env_options": texts(preset.options, variant.options),
+        "seed": cell.seed,
+    }
+
+
+def texts(*options: Mapping[str, Any]) -> list[str]:
+    """Options as they stand in the stored results."""
+    return [f"{name}={value}" for each in options for name, value in each.items()]
+
+
+_PROTOCOL = make_config(
     num_timesteps=1_500_000, hidden_sizes=(64, 64), eval_episodes=0, video=False
 )
-_TINY = dataclasses.replace(
-    _PROTOCOL,
+_TINY = _PROTOCOL.replace(
     num_envs=16,
     unroll_length=8,
     num_minibatches=2,
@@ -173,7 +194,7 @@ PRESETS = {
         episodes=8,
         other_episodes=4,
         columns=("close", "free"),
-        env_options=("episode_length=32",),
+        options={"episode_length": 32},
     ),
     "cpu": Preset("cpu", 5, 3, _PROTOCOL, 1000, 100, _COLUMNS),
     "full": Preset("full", 10, 10, _PROTOCOL, 1000, 100, _COLUMNS),

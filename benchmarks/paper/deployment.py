@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import time
 from typing import Any
@@ -26,27 +25,24 @@ STARTS = 2000
 """Seed of the episodes: the same in every cell, so that all meet the same worlds."""
 RECORDED = 100
 """Episodes of the pictured column that are recorded."""
-ALIKE = ("terminate_on_event=True",)
+ALIKE = {"terminate_on_event": True}
 """Options that no training may change: every deployed episode ends with an event."""
 
 
 def deployed(config: TrainConfig, column: Column) -> TrainConfig:
     """A training's configuration with the world of a column."""
-    return dataclasses.replace(
-        config,
-        env_options=config.env_options + column.options + ALIKE,
-        physics=column.physics or config.physics,
-    )
+    physics = column.physics or config.task.physics
+    return config.replace(**column.options, **ALIKE, physics=physics)
 
 
 def definition(preset: Preset, cell: Cell, column: Column) -> dict[str, Any]:
     """What a deployment depends on."""
-    config = preset.config(cell)
-    world = deployed(config, column)
+    variant = cells.VARIANTS[cell.variant]
+    options = preset.options, variant.options, column.options, ALIKE
     return {
-        "training": cells.definition(config),
-        "env_options": world.env_options,
-        "physics": world.physics,
+        "training": cells.definition(preset, cell),
+        "env_options": cells.texts(*options),
+        "physics": deployed(preset.config(cell), column).task.physics,
         "episodes": episodes(preset, column),
         "starts": STARTS,
     }
@@ -109,4 +105,4 @@ def _world(config: TrainConfig, count: int, filmed: int):
 
 def _recorder(config: TrainConfig, count: int, filmed: int):
     """The task of a configuration and its recorder, compiled once for all seeds."""
-    return _world(dataclasses.replace(config, seed=0), count, filmed)
+    return _world(config.replace(seed=0), count, filmed)

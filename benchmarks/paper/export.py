@@ -7,7 +7,6 @@ is, `train.py --resume` cannot.
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import sys
 from collections.abc import Sequence
@@ -18,9 +17,9 @@ from typing import Annotated
 import tyro
 
 from benchmarks.paper import tasks
-from envs import cli
+from envs.flags import load_config, parse
 from rmp_mjx import runtime
-from rmp_mjx.training.config import ConfigError, TrainConfig, load_config, save_config
+from rmp_mjx.training.config import ConfigError, TrainConfig, save_config
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.learning.rollout import Env
@@ -43,7 +42,7 @@ class Options:
 
 def needed(env: Env, config: TrainConfig) -> TrainState:
     """Shapes of what acting needs of a training state; the rest is None."""
-    whole = seeds.shapes(make_ppo(env, config), config)
+    whole = seeds.shapes(make_ppo(env, config.ppo), config.ppo)
     learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)
     return whole.replace(
         learner=learner, scale=None, rollout=None, key=None, iteration=None
@@ -66,7 +65,7 @@ def export(env: Env, run: Path, out: Path, which: str = "newest") -> int:
         ConfigError: `run` is no run folder, or `out` exists.
         CheckpointError: There is no such checkpoint.
     """
-    config = load_config(run / run_folder.CONFIG)
+    config = load_config(run)
     if out.exists():
         raise ConfigError(f"{out} exists already: delete it, or name another folder")
     kept = Checkpointer(run / run_folder.CHECKPOINTS, read_only=True)
@@ -78,7 +77,7 @@ def export(env: Env, run: Path, out: Path, which: str = "newest") -> int:
     small.close()
     for note in out.rglob("commit_success.txt"):  # names the folder of this machine
         note.write_text("")
-    config = dataclasses.replace(config, run_dir=None, resume=None, overwrite=False)
+    config = config.replace(run_dir=None, resume=None, overwrite=False)
     save_config(config, out / run_folder.CONFIG)
     versions = run / run_folder.VERSIONS
     if versions.exists():
@@ -88,9 +87,9 @@ def export(env: Env, run: Path, out: Path, which: str = "newest") -> int:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Parse and export; returns the exit code."""
-    options = cli.parse(Options, args)
+    options = parse(Options, args)
     try:
-        config = load_config(options.run / run_folder.CONFIG)
+        config = load_config(options.run)
         if options.out.exists():
             raise ConfigError(f"{options.out} exists already")
         runtime.configure()

@@ -250,9 +250,8 @@ def _protocol(place: Store, preset: Preset) -> list[Block]:
     histories = [a["history"] for a in trained]
     last = histories[-1][-1]
     config: dict[str, Any] = trained[-1]["definition"]
-    shared = cells.definition(preset.training)
-    varied = {"env", "controller", "env_options", "seed"}
-    rows = [(k, str(v)) for k, v in shared.items() if k not in varied]
+    shared, options = cells.settings(preset), cells.texts(preset.options)
+    rows = [(k, str(v)) for k, v in shared.items() if k != "seed"]
     size = config["num_envs"] * config["unroll_length"]
     continued = sum(len(history) > 1 for history in histories)
     revisions = sorted({entry["git"] for history in histories for entry in history})
@@ -300,7 +299,7 @@ def _protocol(place: Store, preset: Preset) -> list[Block]:
             ("setting", "value"),
             [
                 *rows,
-                ("options of the tasks", " ".join(preset.env_options) or "default"),
+                ("options of the tasks", " ".join(options) or "default"),
             ],
         ),
     ]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 from rich.console import Console
@@ -17,7 +17,7 @@ from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
     differing_fields,
-    load_config,
+    read_record,
 )
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
@@ -31,7 +31,7 @@ def run_of(place: Store, cell: Cell) -> Path:
 
 def is_trained(place: Store, preset: Preset, cell: Cell) -> bool:
     """Whether a cell's training is in the store, and its run folder still there."""
-    wanted = cells.definition(preset.config(cell))
+    wanted = cells.definition(preset, cell)
     config = run_of(place, cell) / run_folder.CONFIG
     return place.holds(wanted, store.TRAINING, cell) and config.exists()
 
@@ -80,7 +80,7 @@ def train_cell(
         return code
     rows = pl.read_parquet(folder / run_folder.METRICS)
     about = {
-        "definition": cells.definition(wanted),
+        "definition": cells.definition(preset, cell),
         "seconds": float(rows["time/iteration_s"].sum()),
         "history": json.loads((folder / run_folder.VERSIONS).read_text()),
     }
@@ -88,10 +88,10 @@ def train_cell(
     return 0
 
 
-def _saved(folder: Path) -> TrainConfig | None:
-    """Configuration of the run in a folder; None: there is none that can be read."""
+def _saved(folder: Path) -> dict[str, Any] | None:
+    """Record of the run in a folder; None: there is none that can be read."""
     try:
-        return load_config(folder / run_folder.CONFIG)
+        return read_record(folder / run_folder.CONFIG)
     except ConfigError:
         return None
 
@@ -104,8 +104,7 @@ def _run(
     go_on: bool,
 ) -> int:
     """Continue the run in a folder, or begin one there; its exit code."""
-    config = dataclasses.replace(
-        config,
+    config = config.replace(
         allow_changes=allow_changes,
         resume=str(folder) if go_on else None,
         run_dir=None if go_on else str(folder),

@@ -23,7 +23,7 @@ from benchmarks.peers.problem import controller
 from benchmarks.peers.worker import Measure, latency, rate, serve
 from benchmarks.speed.bench_controller import BATCH, random_states
 from rmp_mjx import runtime
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning.ppo import make_ppo
 
 DOORS = {"mujoco": 1024, "mjx": 256}
@@ -83,7 +83,7 @@ def torques(
 
 def trainer_steps() -> Measure:
     """PPO's environment steps a second on the point mass."""
-    config = TrainConfig(**SETTINGS)
+    config = PPOConfig(**SETTINGS)
     ppo = make_ppo(PointTask(), config)
     states = [jax.jit(ppo.init)(jax.random.key(0))]
     iterate = jax.jit(ppo.iterate)

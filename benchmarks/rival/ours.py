@@ -15,8 +15,8 @@ from benchmarks.peers.ours import torques
 from benchmarks.peers.worker import Measure, rate, serve
 from benchmarks.speed.bench_controller import BATCH
 from benchmarks.speed.bench_training import iterations
+from envs.cli import make_config
 from rmp_mjx import runtime
-from rmp_mjx.training.config import TrainConfig
 
 CONTROLLERS = {"rmp_vices": rmp.RMPVICES, "vices": rmp.VICES}
 
@@ -44,9 +44,9 @@ def env_steps(name: str, num_envs: int) -> Measure:
 
 def training(name: str, num_envs: int) -> Measure:
     """Policy steps a second of training, updates included."""
-    config = TrainConfig(controller=name, physics="mujoco", num_envs=num_envs)
+    config = make_config(controller=name, physics="mujoco", num_envs=num_envs)
     each = iterations(config)
-    return rate(lambda: next(each), config.steps_per_iteration)
+    return rate(lambda: next(each), config.ppo.steps_per_iteration)
 
 
 def measures(num_envs: int) -> dict[str, Callable[[], Measure]]:

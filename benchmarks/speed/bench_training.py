@@ -6,7 +6,6 @@ Run as ``python -m benchmarks.bench_training --json FILE``.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import json
 import os
@@ -23,6 +22,7 @@ import numpy as np
 
 import envs
 from benchmarks.common import ROOT, Row, show, write_json
+from envs.cli import make_config
 from rmp_mjx import runtime
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning import seeds
@@ -67,9 +67,9 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def iterations(config: TrainConfig) -> Iterator[tuple[float, float]]:
     """Train on trajectory following; the seconds of each iteration's halves."""
-    env = envs.load("trajectory", controller=config.controller, physics=config.physics)
-    programs = seeds.programs(env, config)
-    state = programs.place(programs.init(seeds.keys(config)))
+    env = envs.make(config.task)
+    programs = seeds.programs(env, config.ppo, config.run.num_devices)
+    state = programs.place(programs.init(seeds.keys(config.ppo)))
     while True:
         start = time.perf_counter()
         state, data, _ = jax.block_until_ready(programs.gather(state))
@@ -88,10 +88,10 @@ def speed(config: TrainConfig, count: int) -> list[Row]:
     """Rows of the default run with each controller."""
     rows, shares = [], []
     for controller in CONTROLLERS:
-        config = dataclasses.replace(config, controller=controller)
+        config = config.replace(controller=controller)
         times = iterate(config, count)
-        rate = config.steps_per_iteration / times.whole
-        note = f"{config.num_envs} environments, updates included; {times.spread}"
+        rate = config.ppo.steps_per_iteration / times.whole
+        note = f"{config.ppo.num_envs} environments, updates included; {times.spread}"
         rows.append(Row(f"ppo_steps_per_s_{controller}", rate, "1/s", note))
         shares.append(np.median(times.learn / (times.gather + times.learn)))
     note = f"share of an iteration outside of the roll-out; {CONTROLLERS[-1]}"
@@ -102,7 +102,7 @@ def cost_of_seeds(config: TrainConfig, count: int) -> list[Row]:
     """Time of several seeds in one program, relative to one seed."""
     whole = []
     for num_seeds in (1, SEEDS):
-        config = dataclasses.replace(config, num_envs=SEED_ENVS, num_seeds=num_seeds)
+        config = config.replace(num_envs=SEED_ENVS, num_seeds=num_seeds)
         whole.append(iterate(config, count).whole)
     note = f"{SEED_ENVS} environments a seed; {whole[0]:.3f} s an iteration of one seed"
     return [Row(f"seeds{SEEDS}_cost_ratio", whole[1] / whole[0], "", note)]
@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure(split_cpu=True, compile_cache=args.first_step is not None)
-    config = TrainConfig(seed=args.seed, num_devices=args.num_devices)
+    config = make_config(seed=args.seed, num_devices=args.num_devices)
     if args.first_step is not None:
         next(iterations(config))
         print(json.dumps(time.time() - args.first_step))

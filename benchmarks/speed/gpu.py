@@ -11,7 +11,6 @@ cells of the paper's grid.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import multiprocessing
 import os
 import sys
@@ -40,7 +39,7 @@ from benchmarks.paper import tasks
 from benchmarks.paper.cells import PRESETS, Cell, Preset
 from envs.scene import TABLE_HEIGHT
 from rmp_mjx import runtime, sim
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.networks import make_agent
@@ -185,9 +184,8 @@ def training(
     programs: Programs, physics: str, num_envs: int, steps: int, episodes: int
 ) -> Part:
     """Train RMP-VICES on trajectory following, and evaluate the policy if wanted."""
-    config = TrainConfig(
-        physics=physics, num_envs=num_envs, num_timesteps=steps, num_minibatches=16
-    )
+    config = PPOConfig(num_envs=num_envs, num_minibatches=16)
+    iterations = -(-steps // config.steps_per_iteration)
     env = envs.load("trajectory", controller="rmp_vices", physics=physics)
     ppo, key = make_ppo(env, config), jax.random.key(0)
 
@@ -203,11 +201,11 @@ def training(
     jax.block_until_ready(step(start))  # Warp compiles its kernels here
 
     def measured() -> list[Row]:
-        state, stats, times = iterate(step, start, config.num_iterations)
+        state, stats, times = iterate(step, start, iterations)
         sums = [found.step_sums for found in stats]
         events = sum(float(one["collision"] + one["joint_limit"]) for one in sums)
         rate = config.steps_per_iteration / float(np.median(times))
-        taken = f"{config.num_iterations * config.steps_per_iteration:,} policy steps"
+        taken = f"{iterations * config.steps_per_iteration:,} policy steps"
         note = f"{num_envs:,} environments, seed 0"
         rows = [
             ("steps_per_s", rate, "1/s", f"updates included; {note}"),
@@ -230,11 +228,9 @@ def training(
 
 def cell(programs: Programs, physics: str, preset: Preset, own: Cell) -> Part:
     """All seeds of a cell of the paper's grid in one program, for some iterations."""
-    config = dataclasses.replace(
-        preset.config(own), physics=physics, num_seeds=preset.seeds
-    )
+    config = preset.config(own).replace(physics=physics, num_seeds=preset.seeds)
     env = tasks.load(config)
-    ppo, keys = make_ppo(env, config), seeds.keys(config)
+    ppo, keys = make_ppo(env, config.ppo), seeds.keys(config.ppo)
     start = programs.add(jax.vmap(ppo.init), keys).result()[0](keys)
     step, compile_s = programs.add(jax.vmap(ppo.iterate), start).result()
     jax.block_until_ready(step(start))  # Warp compiles its kernels here
@@ -243,9 +239,11 @@ def cell(programs: Programs, physics: str, preset: Preset, own: Cell) -> Part:
         count = min(ITERATIONS, config.num_iterations)
         *_, times = iterate(step, start, count)
         seconds = float(np.median(times))
-        rate = config.num_seeds * config.steps_per_iteration / seconds
-        note = f"{config.num_seeds} seeds of {config.num_envs} environments; median of "
-        note += f"{len(times)} iterations, {min(times):.3f} to {max(times):.3f} s"
+        rate = config.ppo.num_seeds * config.ppo.steps_per_iteration / seconds
+        note = f"{config.ppo.num_seeds} seeds of {config.ppo.num_envs} environments; "
+        note += (
+            f"median of {len(times)} iterations, {min(times):.3f} to {max(times):.3f} s"
+        )
         whole = f"{config.num_iterations} such iterations; "
         rows = [
             ("steps_per_s", rate, "1/s", "updates included; " + note),

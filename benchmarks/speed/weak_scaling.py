@@ -18,8 +18,9 @@ from pathlib import Path
 
 from benchmarks.common import ROOT, Row, show, write_json
 from benchmarks.speed.bench_training import iterate
+from envs.cli import make_config
 from rmp_mjx import runtime
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 
 COUNTS = (1, 2, 4, 8)
 
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     runtime.configure()
     if args.worker:
         num_envs, count = args.worker
-        config = TrainConfig(num_envs=num_envs, num_devices=count)
+        config = make_config(num_envs=num_envs, num_devices=count)
         times = iterate(config, args.iterations)
         print(json.dumps([sorted(half)[len(half) // 2] for half in times]))
         return
@@ -66,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         num_envs = count * args.envs_per_device
         spread = seconds(args, num_envs, count)
         single = spread if count == 1 else seconds(args, num_envs, 1)
-        steps = num_envs * TrainConfig.unroll_length
+        steps = num_envs * PPOConfig.unroll_length
         note = f"{num_envs} environments; roll-out {spread[0]:.3f} s, learner "
         note += f"{spread[1]:.3f} s; one device {single[0]:.3f} s, {single[1]:.3f} s"
         rate = steps / sum(spread)

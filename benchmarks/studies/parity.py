@@ -34,7 +34,7 @@ from benchmarks.common import machine
 from envs.brax import BraxTask
 from envs.types import State
 from rmp_mjx import runtime
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.learning.networks import make_agent
 from rmp_mjx.training.learning.ppo import make_ppo
@@ -95,9 +95,8 @@ Curve = list[tuple[int, float]]
 
 def train_ours(task: Any, steps: int, points: int, seed: int) -> Curve:
     """Our loop, evaluated as often as Brax's."""
-    config = TrainConfig(
+    config = PPOConfig(
         seed=seed,
-        num_timesteps=steps,
         hidden_sizes=HIDDEN,
         value_learning_rate=SIZES["learning_rate"],
         target_kl=0.0,
@@ -113,12 +112,13 @@ def train_ours(task: Any, steps: int, points: int, seed: int) -> Curve:
         agent = make_agent(ppo.networks, state.normalizer, state.learner.policy, False)
         return float(episodes(agent, key)[0]["return"].mean())
 
-    curve, each = [], config.num_iterations // (points - 1)
-    for done in range(config.num_iterations + 1):
+    iterations = -(-steps // config.steps_per_iteration)
+    curve, each = [], iterations // (points - 1)
+    for done in range(iterations + 1):
         if done % each == 0:
             found = mean_return(state, jax.random.key(1000 * seed + done))
             curve.append((done * config.steps_per_iteration, found))
-        if done < config.num_iterations:
+        if done < iterations:
             state, _, _ = iterate(state)
     return curve
 

@@ -31,10 +31,9 @@ from benchmarks.studies import experts
 from benchmarks.studies.parameters import Parameters
 from benchmarks.studies.random_policies import REACHING_LIMIT, poisson
 from benchmarks.studies.safety_study import Group, Study, parts_of, with_parts
+from envs.flags import load_config
 from rmp_mjx import runtime
-from rmp_mjx.training.config import load_config
 from rmp_mjx.training.learning.networks import Agent
-from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.loop import load_agent
 
 SEARCH_SEED, REPORT_SEED = 100, 200
@@ -321,7 +320,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def policy_of(run: Path) -> Agent:
     """The mean policy of a trajectory run."""
-    config = load_config(run / run_folder.CONFIG)
+    config = load_config(run)
     return load_agent(envs.load("trajectory"), config, run, True, print)[1]
 
 

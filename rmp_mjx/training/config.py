@@ -1,56 +1,63 @@
-"""Training configuration: one flat dataclass, checked before anything compiles."""
+"""Training configuration: three small dataclasses, checked when they are made."""
 
 import dataclasses
-import difflib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from rmp_mjx.files import write_text
-
-CONTROLLERS = ("rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf")
-PHYSICS = ("auto", "mujoco", "mjx", "warp")
+from rmp_mjx.names import unknown
 
 
 class ConfigError(ValueError):
     """A configuration that cannot be run; the message says what to change."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """Train a policy with PPO (Schulman et al., 2017)."""
+class Task(Protocol):
+    """What training needs of a task's options; a frozen dataclass."""
 
-    env: str = "trajectory"
-    """Task to learn."""
-    controller: str = "rmp_vices"
-    """Low-level controller that the policy commands: rmp_vices, vices,
-    rmp_vices_literal (the paper's formulas with their signs corrected), osc (vices with
-    a fixed impedance), or vices_cbf (vices behind a safety filter)."""
-    physics: str = "auto"
-    """Physics engine: mujoco (C threads), mjx (JAX), warp (MuJoCo Warp; extra `warp`),
-    or auto: mujoco on a CPU, else mjx."""
-    env_options: tuple[str, ...] = ()
-    """Options of the task as NAME=VALUE, for instance obstacles=2 layout=close."""
+    @property
+    def title(self) -> str:
+        """The task in a few words, for figures and folder names."""
+        ...
+
+    def record(self) -> dict[str, Any]:
+        """The options by name, JSON-ready: equal records are equal tasks."""
+        ...
+
+
+AnyTask = TypeVar("AnyTask", bound=Task)
+
+
+def _at_least_one(config: Any, *names: str) -> None:
+    for name in names:
+        if getattr(config, name) < 1:
+            raise ConfigError(f"{name} must be at least 1, is {getattr(config, name)}")
+
+
+def _positive(config: Any, *names: str) -> None:
+    for name in names:
+        if not getattr(config, name) > 0.0:
+            raise ConfigError(f"{name} must be positive, is {getattr(config, name)}")
+
+
+def _not_negative(config: Any, *names: str) -> None:
+    for name in names:
+        if not getattr(config, name) >= 0:
+            raise ConfigError(f"{name} must not be negative: {getattr(config, name)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """The learning: what defines a run, together with its task."""
+
     num_envs: int = 256
     """Environments that run in parallel, for each agent."""
-    num_timesteps: int = 400_000
-    """Policy steps of an agent over all its environments, rounded up to whole
-    iterations."""
     seed: int = 0
     """Seed of the networks, the environments and the minibatch order."""
     num_seeds: int = 1
     """Agents that train in one program, apart, with seeds seed, seed + 1, ..."""
-    run_dir: str | None = None
-    """Folder of this run; default: runs/ENV-CONTROLLER-seedSEED-TIME."""
-    resume: str | None = None
-    """Run folder to continue; its saved configuration is the default then."""
-    overwrite: bool = False
-    """Delete the results of an earlier run found in run_dir."""
-    allow_changes: bool = False
-    """Resume although packages or our code have changed; it is no exact continuation
-    then."""
-
     unroll_length: int = 16
     """Policy steps per environment and iteration."""
     num_minibatches: int = 8
@@ -83,6 +90,76 @@ class TrainConfig:
     init_log_std: float = -0.5
     """Initial log standard deviation of the policy's actions."""
 
+    def __post_init__(self):
+        """Check the values.
+
+        Raises:
+            ConfigError: Something cannot be run; the message names the option.
+        """
+        _at_least_one(
+            self,
+            "num_envs",
+            "num_seeds",
+            "unroll_length",
+            "num_minibatches",
+            "num_groups",
+            "num_updates_per_batch",
+        )
+        _positive(
+            self,
+            "learning_rate",
+            "value_learning_rate",
+            "clipping_epsilon",
+            "max_grad_norm",
+        )
+        _not_negative(self, "entropy_cost", "vf_coefficient", "target_kl", "seed")
+        for name in ("discounting", "gae_lambda"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ConfigError(
+                    f"{name} must lie in [0, 1], is {getattr(self, name)}"
+                )
+        if not self.hidden_sizes or min(self.hidden_sizes) < 1:
+            raise ConfigError(f"hidden_sizes must be positive, is {self.hidden_sizes}")
+        if self.steps_per_iteration % self.num_minibatches:
+            raise ConfigError(
+                f"num_envs * unroll_length = {self.num_envs} * {self.unroll_length} = "
+                f"{self.steps_per_iteration} does not divide into num_minibatches = "
+                f"{self.num_minibatches} equal parts"
+            )
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Policy steps that each agent gathers in one iteration."""
+        return self.num_envs * self.unroll_length
+
+    @property
+    def groups(self) -> int:
+        """Groups of environments: the most, up to `num_groups`, that divide evenly."""
+        return max(
+            n
+            for n in range(1, self.num_groups + 1)
+            if self.num_groups % n == 0
+            and self.num_envs % n == 0
+            and self.num_envs // n * self.unroll_length % self.num_minibatches == 0
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """The run: what may differ between a run and its continuation."""
+
+    num_timesteps: int = 400_000
+    """Policy steps of an agent over all its environments, rounded up to whole
+    iterations."""
+    run_dir: str | None = None
+    """Folder of this run; default: runs/TASK-seedSEED-TIME."""
+    resume: str | None = None
+    """Run folder to continue; its saved configuration is the default then."""
+    overwrite: bool = False
+    """Delete the results of an earlier run found in run_dir."""
+    allow_changes: bool = False
+    """Resume although packages or our code have changed; it is no exact continuation
+    then."""
     num_devices: int | None = None
     """At most this many devices share the environments; default: all there are."""
     log_interval: int = 1
@@ -104,173 +181,185 @@ class TrainConfig:
     mlflow: str | None = None
     """Also log to this experiment of MLflow (needs the extra `mlflow`)."""
 
-    @property
-    def steps_per_iteration(self) -> int:
-        """Policy steps that each agent gathers in one iteration."""
-        return self.num_envs * self.unroll_length
+    def __post_init__(self):
+        """Check the values.
+
+        Raises:
+            ConfigError: Something cannot be run; the message names the option.
+        """
+        _at_least_one(
+            self,
+            "num_timesteps",
+            "log_interval",
+            "checkpoint_interval",
+            "checkpoints_kept",
+        )
+        _not_negative(self, "keep_every", "eval_episodes")
+        if self.num_devices is not None:
+            _at_least_one(self, "num_devices")
+        if self.keep_every % self.checkpoint_interval:
+            raise ConfigError(
+                f"keep_every = {self.keep_every} is no multiple of "
+                f"checkpoint_interval = {self.checkpoint_interval}"
+            )
+        if self.resume and self.run_dir and self.resume != self.run_dir:
+            raise ConfigError("resume continues in its own folder: leave run_dir out")
+        if self.resume and self.overwrite:
+            raise ConfigError("resume and overwrite exclude each other")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig(Generic[AnyTask]):
+    """A task, the learning, the run, and the trainer: all that training is told."""
+
+    task: AnyTask
+    """Options of the task."""
+    ppo: PPOConfig = PPOConfig()
+    """The learning."""
+    run: RunConfig = RunConfig()
+    """The run."""
+    trainer: Literal["ours", "brax"] = "ours"
+    """Who trains: ours, or brax (Brax's own PPO), which cannot resume, train several
+    seeds in one program, or repeat a run exactly on another number of devices."""
+
+    def __post_init__(self):
+        """Check what the parts ask for together.
+
+        Raises:
+            ConfigError: Something cannot be run; the message names the option.
+        """
+        if self.trainer == "brax" and self.run.resume:
+            raise ConfigError("trainer brax cannot resume a run")
+        if self.trainer == "brax" and self.ppo.num_seeds > 1:
+            raise ConfigError("trainer brax trains one seed: leave num_seeds out")
 
     @property
     def num_iterations(self) -> int:
         """Iterations that reach `num_timesteps`."""
-        return -(-self.num_timesteps // self.steps_per_iteration)
+        return -(-self.run.num_timesteps // self.ppo.steps_per_iteration)
 
     @property
-    def groups(self) -> int:
-        """Groups of environments: the most, up to `num_groups`, that divide evenly."""
-        return max(
-            n
-            for n in range(1, self.num_groups + 1)
-            if self.num_groups % n == 0
-            and self.num_envs % n == 0
-            and self.num_envs // n * self.unroll_length % self.num_minibatches == 0
-        )
+    def title(self) -> str:
+        """The run in a few words."""
+        first, last = self.ppo.seed, self.ppo.seed + self.ppo.num_seeds - 1
+        seeds = f"seed {first}" if last == first else f"seeds {first} to {last}"
+        return f"{self.task.title}, {seeds}"
+
+    def replace(self, **changes: Any) -> "TrainConfig[AnyTask]":
+        """A copy with other values; each name finds its part (`seed` is in `ppo`).
+
+        Raises:
+            ConfigError: No part has such an option; the message lists the names.
+        """
+        own: dict[str, Any] = {}
+        nested: dict[str, dict[str, Any]] = {"task": {}, "ppo": {}, "run": {}}
+        owner = {
+            field.name: part
+            for part in nested
+            for field in dataclasses.fields(getattr(self, part))
+        }
+        valid = [*owner, *nested, "trainer"]
+        for name, value in changes.items():
+            if name not in valid:
+                raise ConfigError(unknown("option", name, valid))
+            (nested[owner[name]] if name in owner else own)[name] = value
+        for part, values in nested.items():
+            if values:
+                before = own.get(part, getattr(self, part))
+                own[part] = dataclasses.replace(before, **values)
+        return dataclasses.replace(self, **own)
+
+    def record(self) -> dict[str, Any]:
+        """The configuration as it is written to JSON."""
+        return {
+            "task": self.task.record(),
+            "ppo": dataclasses.asdict(self.ppo),
+            "run": dataclasses.asdict(self.run),
+            "trainer": self.trainer,
+        }
 
 
-# May differ between a run and its continuation; everything else defines the run.
-RESUMABLE = frozenset(
-    {
-        "num_timesteps",
-        "run_dir",
-        "resume",
-        "overwrite",
-        "allow_changes",
-        "num_devices",
-        "log_interval",
-        "checkpoint_interval",
-        "checkpoints_kept",
-        "keep_every",
-        "wandb",
-        "mlflow",
-        "eval_episodes",
-        "eval_deterministic",
-        "video",
-    }
-)
-AT_LEAST_ONE = (
-    "num_envs",
-    "num_seeds",
-    "num_timesteps",
-    "unroll_length",
-    "num_minibatches",
-    "num_groups",
-    "num_updates_per_batch",
-    "log_interval",
-    "checkpoint_interval",
-    "checkpoints_kept",
-)
-POSITIVE = (
-    "learning_rate",
-    "value_learning_rate",
-    "clipping_epsilon",
-    "max_grad_norm",
-)
-NOT_NEGATIVE = (
-    "entropy_cost",
-    "vf_coefficient",
-    "target_kl",
-    "keep_every",
-    "eval_episodes",
-    "seed",
-)
-
-
-def _known(value: str, what: str, names: Sequence[str]) -> None:
-    if value in names:
-        return
-    near = difflib.get_close_matches(value, names, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    raise ConfigError(f"unknown {what} {value!r}; known: {', '.join(names)}.{hint}")
-
-
-def validate(config: TrainConfig, known_envs: Iterable[str]) -> TrainConfig:
-    """Check a configuration; compiles nothing.
+def defining(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What defines a run, by flat name: its task, its learning, its trainer.
 
     Args:
-        config: The configuration.
-        known_envs: Names that the environment loader accepts.
+        record: `TrainConfig.record()`, or what JSON gives back of it.
+    """
+    trainer = {"trainer": record["trainer"]} if "trainer" in record else {}
+    return {**record.get("task", {}), **record.get("ppo", {}), **trainer}
 
-    Returns:
-        The same configuration.
+
+def differing_fields(
+    saved: Mapping[str, Any], config: TrainConfig
+) -> dict[str, tuple[Any, Any]]:
+    """Options that define a run and differ between a saved record and a configuration.
+
+    What an older record does not say has its default.
 
     Raises:
-        ConfigError: Something cannot be run; the message names the option.
+        ConfigError: The record is of version 0.1.
     """
-    _known(config.env, "env", sorted(known_envs))
-    _known(config.controller, "controller", CONTROLLERS)
-    _known(config.physics, "physics", PHYSICS)
-    for text in config.env_options:
-        name = text.partition("=")[0]
-        if name in ("controller", "physics"):
-            raise ConfigError(f"{name} is an option of its own: --{name}")
-    for name in AT_LEAST_ONE:
-        if getattr(config, name) < 1:
-            raise ConfigError(f"{name} must be at least 1, is {getattr(config, name)}")
-    for name in POSITIVE:
-        if not getattr(config, name) > 0.0:
-            raise ConfigError(f"{name} must be positive, is {getattr(config, name)}")
-    for name in NOT_NEGATIVE:
-        if not getattr(config, name) >= 0:
-            raise ConfigError(f"{name} must not be negative: {getattr(config, name)}")
-    for name in ("discounting", "gae_lambda"):
-        if not 0.0 <= getattr(config, name) <= 1.0:
-            raise ConfigError(f"{name} must lie in [0, 1], is {getattr(config, name)}")
-    if not config.hidden_sizes or min(config.hidden_sizes) < 1:
-        raise ConfigError(f"hidden_sizes must be positive, is {config.hidden_sizes}")
-    if config.steps_per_iteration % config.num_minibatches:
-        raise ConfigError(
-            f"num_envs * unroll_length = {config.num_envs} * {config.unroll_length} = "
-            f"{config.steps_per_iteration} does not divide into num_minibatches = "
-            f"{config.num_minibatches} equal parts"
-        )
-    if config.num_devices is not None and config.num_devices < 1:
-        raise ConfigError(f"num_devices must be at least 1, is {config.num_devices}")
-    if config.keep_every % config.checkpoint_interval:
-        raise ConfigError(
-            f"keep_every = {config.keep_every} is no multiple of checkpoint_interval = "
-            f"{config.checkpoint_interval}"
-        )
-    if config.resume and config.run_dir and config.resume != config.run_dir:
-        raise ConfigError("resume continues in its own folder: leave run_dir out")
-    if config.resume and config.overwrite:
-        raise ConfigError("resume and overwrite exclude each other")
-    return config
-
-
-def differing_fields(old: TrainConfig, new: TrainConfig) -> dict[str, tuple]:
-    """Fields that define a run and differ between two configurations."""
+    if "ppo" not in saved:
+        raise ConfigError("its configuration is of version 0.1: convert it first")
+    usual = TrainConfig(type(config.task)())
+    default, given, new = (
+        defining(json.loads(json.dumps(record)))
+        for record in (usual.record(), saved, config.record())
+    )
+    old = default | given
     return {
-        field.name: (getattr(old, field.name), getattr(new, field.name))
-        for field in dataclasses.fields(TrainConfig)
-        if field.name not in RESUMABLE
-        and getattr(old, field.name) != getattr(new, field.name)
+        name: (old.get(name), new.get(name))
+        for name in old | new
+        if old.get(name) != new.get(name)
     }
 
 
 def save_config(config: TrainConfig, path: Path) -> None:
     """Write a configuration as JSON."""
-    write_text(path, json.dumps(dataclasses.asdict(config), indent=2) + "\n")
+    write_text(path, json.dumps(config.record(), indent=2) + "\n")
 
 
-def config_of(saved: dict[str, Any]) -> TrainConfig:
-    """A configuration from the values that JSON gives back."""
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in saved.items()
-    }
-    return TrainConfig(**values)
+def config_of(
+    record: Mapping[str, Any], task: Callable[[Mapping[str, Any]], AnyTask]
+) -> TrainConfig[AnyTask]:
+    """A configuration from a record that JSON gives back; missing fields take defaults.
 
-
-def load_config(path: Path) -> TrainConfig:
-    """Read a configuration written by `save_config`; missing fields take defaults.
+    Args:
+        record: As `TrainConfig.record` makes it.
+        task: The task's options from their part of the record.
 
     Raises:
-        ConfigError: The file is missing, is not JSON, or has unknown fields.
+        ConfigError: An unknown field, or a value that cannot be run.
+    """
+    ppo: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in record["ppo"].items()
+    }
+    try:
+        return TrainConfig(
+            task(record["task"]),
+            PPOConfig(**ppo),
+            RunConfig(**record["run"]),
+            record.get("trainer", "ours"),
+        )
+    except (TypeError, ValueError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The record in a file written by `save_config`.
+
+    Raises:
+        ConfigError: The file is missing, is not JSON, or is no record.
     """
     try:
-        return config_of(json.loads(path.read_text()))
+        record = json.loads(path.read_text())
     except FileNotFoundError as error:
         raise ConfigError(f"{path.parent} is no run folder: no {path.name}") from error
-    except (json.JSONDecodeError, AttributeError, TypeError) as error:
+    except json.JSONDecodeError as error:
         raise ConfigError(f"{path} cannot be read as a configuration: {error}") from (
             error
         )
+    if not isinstance(record, dict):
+        raise ConfigError(f"{path} cannot be read as a configuration: no JSON object")
+    return record

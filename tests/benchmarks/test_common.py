@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import common
 from benchmarks.speed import bench_controller, bench_training
-from rmp_mjx.training.config import TrainConfig
+from envs.cli import make_config
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +73,8 @@ def test_a_process_that_is_to_take_the_first_step_prints_its_seconds(
     small = {"num_envs": 8, "unroll_length": 4, "num_minibatches": 2}
     monkeypatch.setattr(
         bench_training,
-        "TrainConfig",
-        lambda **given: TrainConfig(**small, **given),
+        "make_config",
+        lambda **given: make_config(**small, **given),
     )
     bench_training.main(["--first_step", str(time.time())])
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) > 0

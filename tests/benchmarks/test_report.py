@@ -8,7 +8,8 @@ import polars as pl
 import pytest
 
 from benchmarks import report
-from rmp_mjx.training.config import TrainConfig, save_config
+from envs.cli import make_config
+from rmp_mjx.training.config import save_config
 from rmp_mjx.training.runs import run_folder
 
 
@@ -22,7 +23,7 @@ def runs(tmp_path_factory):
         ("b", "vices", 1, 1),
         ("c", "rmp_vices", 0, 2),
     ):
-        config = TrainConfig(controller=controller, seed=seed, num_seeds=num_seeds)
+        config = make_config(controller=controller, seed=seed, num_seeds=num_seeds)
         folder = base / f"{name} <script>"
         folder.mkdir()
         save_config(config, folder / run_folder.CONFIG)
@@ -100,6 +101,6 @@ def test_curves_that_never_move_are_named_and_not_drawn(runs):
 def test_a_folder_that_is_no_run_is_refused(runs, tmp_path, capsys):
     assert report.main([str(tmp_path)]) == 2
     assert "no run folder" in capsys.readouterr().err
-    save_config(TrainConfig(), tmp_path / run_folder.CONFIG)
+    save_config(make_config(), tmp_path / run_folder.CONFIG)
     assert report.main([str(tmp_path)]) == 2
     assert "no rows yet" in capsys.readouterr().err

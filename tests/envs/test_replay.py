@@ -1,6 +1,5 @@
 """Replaying a written step in MuJoCo C."""
 
-import dataclasses
 import json
 
 import jax
@@ -10,30 +9,27 @@ import pytest
 
 import envs
 from envs import replay
-from rmp_mjx.training.config import TrainConfig
+from envs.cli import make_config
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.runs import run_folder
 
-CONFIG = TrainConfig(
+CONFIG = make_config(
     controller="vices",
     physics="mujoco",
-    env_options=("obstacles=1", "obstacle_speed=0.1", "obstacle_noise=0.01"),
+    obstacles=1,
+    obstacle_speed=0.1,
+    obstacle_noise=0.01,
 )
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """`written(change)`: file of a batch's second lane, the state changed before."""
-    env = envs.load(
-        "trajectory",
-        controller="vices",
-        physics="mujoco",
-        **envs.parse_options("trajectory", CONFIG.env_options),
-    )
+    env = envs.make(CONFIG.task)
     start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 3))
     action = 0.3 * jnp.ones((3, env.action_size))
     folder = tmp_path_factory.mktemp("dumps")
-    about = {"config": dataclasses.asdict(CONFIG), "iteration": 3, "seed": 0}
+    about = {"config": CONFIG.record(), "iteration": 3, "seed": 0}
 
     def write(name, change=lambda state, action: (state, action)):
         happened = jnp.array([False, True, False])

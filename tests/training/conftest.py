@@ -14,7 +14,6 @@ from rmp_mjx.training.runs.loop import train
 from tests.training import toys
 
 SMALL = {
-    "env": "counter",
     "num_envs": 8,
     "unroll_length": 8,
     "num_minibatches": 2,
@@ -27,11 +26,16 @@ SMALL = {
 ITERATIONS = 4
 
 
+def small(**changes):
+    """A small configuration of the counting toy."""
+    return TrainConfig(toys.Options()).replace(**{**SMALL, **changes})
+
+
 def run(folder, console=None, **changes):
     """Train on the counting toy; `folder` may hold a run to resume."""
     steps = SMALL["num_envs"] * SMALL["unroll_length"] * ITERATIONS
-    options = {**SMALL, "num_timesteps": steps, "run_dir": str(folder), **changes}
-    config = TrainConfig(**options)
+    options = {"num_timesteps": steps, "run_dir": str(folder), **changes}
+    config = small(**options)
     folder, lock = run_folder.open_run(config)
     with lock:
         console = console or Console(quiet=True)
@@ -48,7 +52,7 @@ def bits(leaf):
 
 def newest_state(folder, config):
     """Number and state of the newest checkpoint of a counting toy's run."""
-    ppo = make_ppo(toys.Counter(), config)
+    ppo = make_ppo(toys.Counter(), config.ppo)
     template = jax.eval_shape(ppo.init, jax.random.key(0))
     store = Checkpointer(folder / run_folder.CHECKPOINTS, read_only=True)
     step, state = store.restore(template, pytest.fail)

@@ -11,6 +11,22 @@ import jax.numpy as jnp
 from rmp_mjx.pytree import Pytree
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a toy can be asked for; only training's records see it."""
+
+    env: str = "counter"
+    controller: str = "rmp_vices"
+    variant: str = "light"
+
+    @property
+    def title(self):
+        return f"{self.env}, {self.controller}"
+
+    def record(self):
+        return dataclasses.asdict(self)
+
+
 class ToyState(Pytree):
     """State of a toy environment."""
 
@@ -30,7 +46,7 @@ class Toy:
     action_size: int = 1
     dt: float = 0.05
     episode_length: int = 1
-    physics: str = "toy"
+    engine: str = "toy"
 
     task_metrics = {"effort": "mean", "final": "last"}  # noqa: RUF012
 

@@ -10,7 +10,7 @@ from brax.training.agents.ppo.networks import PPONetworks
 from jaxtyping import Array, Bool, PRNGKeyArray
 
 from rmp_mjx.pytree import Pytree
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 
 EPSILON = 1e-5
 """Adam's term against division by zero."""
@@ -79,7 +79,7 @@ class Optimizers:
         return Learner(policy, value, policy_opt, value_opt)
 
 
-def make_optimizers(config: TrainConfig) -> Optimizers:
+def make_optimizers(config: PPOConfig) -> Optimizers:
     """The optimizers that a configuration asks for."""
 
     def adam(rate: float) -> optax.GradientTransformation:

@@ -23,7 +23,7 @@ from brax.training.agents.ppo.networks import PPONetworks
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices, rollout, value_scale
 from rmp_mjx.training.learning.learner import Learner, Optimizers, make_optimizers
 from rmp_mjx.training.learning.networks import (
@@ -46,7 +46,7 @@ class PPO:
 
     env: rollout.Env
     """Single environment."""
-    config: TrainConfig
+    config: PPOConfig
     """PPO's options."""
     mesh: Mesh
     """Devices that share the environments."""
@@ -163,7 +163,7 @@ class PPO:
         return distribution(self.networks, logits).scale.mean()
 
 
-def make_ppo(env: rollout.Env, config: TrainConfig, mesh: Mesh | None = None) -> PPO:
+def make_ppo(env: rollout.Env, config: PPOConfig, mesh: Mesh | None = None) -> PPO:
     """PPO for an environment.
 
     Args:

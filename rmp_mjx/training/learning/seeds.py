@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jaxtyping import Array, Key
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices
 from rmp_mjx.training.learning.ppo import PPO, make_ppo
 from rmp_mjx.training.learning.rollout import Env
@@ -36,27 +36,22 @@ class Programs(NamedTuple):
     """Spread a state over the devices, every array in a buffer of its own."""
 
 
-def keys(config: TrainConfig) -> Key[Array, "*k"]:
+def keys(config: PPOConfig) -> Key[Array, "*k"]:
     """The keys that the agents start from: one key, or (num_seeds,)."""
     if config.num_seeds == 1:
         return jax.random.key(config.seed)
     return jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
 
 
-def title(config: TrainConfig) -> str:
-    """The seeds in words."""
-    first, last = config.seed, config.seed + config.num_seeds - 1
-    return f"seed {first}" if last == first else f"seeds {first} to {last}"
-
-
-def programs(env: Env, config: TrainConfig) -> Programs:
+def programs(env: Env, config: PPOConfig, num_devices: int | None = None) -> Programs:
     """Compile PPO for all seeds; the devices share every agent's environments.
 
     Args:
         env: Single environment.
-        config: Validated configuration.
+        config: The learning.
+        num_devices: At most this many devices; None: all there are.
     """
-    mesh = devices.make_mesh(config.groups, config.num_devices)
+    mesh = devices.make_mesh(config.groups, num_devices)
     ppo = make_ppo(env, config, mesh)
     seeded = int(config.num_seeds > 1)
     many = jax.vmap if seeded else lambda function: function
@@ -77,12 +72,12 @@ def programs(env: Env, config: TrainConfig) -> Programs:
     )
 
 
-def of_seed(tree: Any, index: int, config: TrainConfig) -> Any:
+def of_seed(tree: Any, index: int, config: PPOConfig) -> Any:
     """One seed's part of a tree: of a state, of metrics, or of an agent."""
     return jax.tree.map(lambda x: x[index], tree) if config.num_seeds > 1 else tree
 
 
-def shapes(ppo: PPO, config: TrainConfig) -> TrainState:
+def shapes(ppo: PPO, config: PPOConfig) -> TrainState:
     """Shapes and dtypes of the state of all seeds."""
     init = jax.vmap(ppo.init) if config.num_seeds > 1 else ppo.init
     return jax.eval_shape(init, keys(config))

@@ -2,7 +2,7 @@
 
 from jaxtyping import Array, Float
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import value_scale
 from rmp_mjx.training.learning.advantages import generalised_advantages
 from rmp_mjx.training.learning.loss import Batch
@@ -19,7 +19,7 @@ Metrics = dict[str, Float[Array, ""]]
 
 
 def make_batch(
-    config: TrainConfig,
+    config: PPOConfig,
     data: Transition,
     values: Float[Array, "t b"],
     next_values: Float[Array, "t b"],

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rmp_mjx.pytree import Pytree
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices
 from rmp_mjx.training.learning.learner import Learner, Optimizers
 from rmp_mjx.training.learning.loss import Batch, ppo_loss
@@ -44,7 +44,7 @@ class Update:
     """Policy, value function and action distribution."""
     optimizers: Optimizers
     """Their optimizers."""
-    config: TrainConfig
+    config: PPOConfig
     """PPO's options."""
 
     def minibatch(

@@ -54,7 +54,7 @@ def train(
 
     Args:
         env: Single environment.
-        config: Validated configuration; `config.resume` continues `folder`.
+        config: Configuration; `config.run.resume` continues `folder`.
         folder: Run folder, prepared by `run_folder.open_run`.
         console: Terminal.
         commands: The application's commands, for messages; None: it has none.
@@ -69,7 +69,7 @@ def train(
     """
     console = console or Console()
     commands = commands or Commands()
-    programs = seeds.programs(env, config)
+    programs = seeds.programs(env, config.ppo, config.run.num_devices)
     checkpoints = _open_checkpoints(config, folder)
     state, first = _start(programs, config, checkpoints, console)
     _announce(config, folder, programs.mesh.size, console)
@@ -93,7 +93,7 @@ def train(
     normalizer, policy = jax.device_get((state.normalizer, state.learner.policy))
     return TrainResult(
         agent=make_agent(
-            programs.ppo.networks, normalizer, policy, config.eval_deterministic
+            programs.ppo.networks, normalizer, policy, config.run.eval_deterministic
         ),
         iterations=done,
         exit_code=128 + stopping if stopping else 0,
@@ -106,7 +106,7 @@ class _Loop:
     """The iterations of a run, and what happens after each."""
 
     config: TrainConfig
-    """Validated configuration."""
+    """Configuration."""
     programs: seeds.Programs
     """The compiled parts of an iteration."""
     logger: RunLogger | None
@@ -136,7 +136,7 @@ class _Loop:
             broken = self.report(state, rows)
             stopping = distributed.largest(stop.signal or 0)
             final = bool(done == config.num_iterations or stopping or broken)
-            if final or done % config.checkpoint_interval == 0:
+            if final or done % config.run.checkpoint_interval == 0:
                 self.save(state, done, final, bool(broken))
             if broken:
                 raise TrainingFailure(f"{broken}; {self.saver.how_to_continue()}")
@@ -149,13 +149,13 @@ class _Loop:
         state, learning = self.programs.learn(state, data)
         jax.block_until_ready(state)
         seconds = time.monotonic() - began
-        return state, make_rows(self.config, number, seconds, stats, learning)
+        return state, make_rows(self.config.ppo, number, seconds, stats, learning)
 
     def report(self, state: TrainState, rows: list[Row]) -> str | None:
         """Log the rows and look for bad numbers; why training must stop, or None."""
         done = int(rows[0]["iteration"] or 0)
         last = done == self.config.num_iterations
-        if self.logger and (last or done % self.config.log_interval == 0):
+        if self.logger and (last or done % self.config.run.log_interval == 0):
             self.logger.add(*rows)
         self.saver.count(rows)
         fault = None
@@ -177,17 +177,18 @@ class _Loop:
 def _open_checkpoints(config: TrainConfig, folder: Path) -> Checkpointer | None:
     """The run's checkpoints; None for a process that neither reads nor writes them."""
     primary = distributed.is_primary()
-    if not primary and not config.resume:
+    if not primary and not config.run.resume:
         return None
     place = folder / run_folder.CHECKPOINTS
-    return Checkpointer(place, config.checkpoints_kept, config.keep_every, not primary)
+    kept, forever = config.run.checkpoints_kept, config.run.keep_every
+    return Checkpointer(place, kept, forever, not primary)
 
 
 def _open_logger(
     config: TrainConfig, folder: Path, done: int, console: Console
 ) -> RunLogger:
     """The logger of a new run, or of one that continues after `done` iterations."""
-    after = done * config.steps_per_iteration if config.resume else None
+    after = done * config.ppo.steps_per_iteration if config.run.resume else None
     trackers = open_trackers(config, folder, folder / run_folder.TENSORBOARD, after)
     path = folder / run_folder.METRICS
     return RunLogger(path, config.num_iterations, done, console, trackers)
@@ -208,16 +209,16 @@ def _start(
     console: Console,
 ) -> tuple[TrainState, int]:
     """The first state, new or restored, and its finished iterations."""
-    nothing = config.resume and checkpoints and not checkpoints.steps
+    nothing = config.run.resume and checkpoints and not checkpoints.steps
     if nothing:
-        console.print(f"{config.resume} has no checkpoint yet and begins anew")
-    if checkpoints is None or not config.resume or nothing:
+        console.print(f"{config.run.resume} has no checkpoint yet and begins anew")
+    if checkpoints is None or not config.run.resume or nothing:
         # donation wants distinct buffers
-        return programs.place(programs.init(seeds.keys(config))), 0
-    done, state = checkpoints.restore(seeds.shapes(programs.ppo, config), console.print)
+        return programs.place(programs.init(seeds.keys(config.ppo))), 0
+    done, state = checkpoints.restore(seeds.shapes(programs.ppo, config.ppo), console.print)
     if done >= config.num_iterations:
         console.print(
-            f"{config.resume} has finished: {done} iterations; "
+            f"{config.run.resume} has finished: {done} iterations; "
             "a larger --num_timesteps continues it"
         )
     return programs.place(state), done
@@ -249,8 +250,8 @@ def load_agent(
     Raises:
         CheckpointError: There is no usable checkpoint.
     """
-    ppo = make_ppo(env, config)
-    whole = seeds.shapes(ppo, config)
+    ppo = make_ppo(env, config.ppo)
+    whole = seeds.shapes(ppo, config.ppo)
     learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)
     needed = whole.replace(
         learner=learner, scale=None, rollout=None, key=None, iteration=None
@@ -261,4 +262,4 @@ def load_agent(
     stacked = make_agent(
         ppo.networks, state.normalizer, state.learner.policy, deterministic
     )
-    return step, seeds.of_seed(stacked, seed_index, config)
+    return step, seeds.of_seed(stacked, seed_index, config.ppo)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import polars as pl
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning.rollout import RolloutStats
 from rmp_mjx.training.learning.seeds import of_seed
 from rmp_mjx.training.stats import bootstrap_curve, interquartile_mean
@@ -60,7 +60,7 @@ def make_row(
 
 
 def make_rows(
-    config: TrainConfig,
+    config: PPOConfig,
     iteration: int,
     seconds: float,
     stats: RolloutStats,

@@ -20,7 +20,7 @@ from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
     differing_fields,
-    load_config,
+    read_record,
     save_config,
 )
 
@@ -74,17 +74,26 @@ RESULTS = (
 
 
 def default_run_dir(config: TrainConfig) -> Path:
-    """A new folder name under runs/, from the task, the controller and the time."""
+    """A new folder name under runs/, from the task, the seed and the time."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
-    name = f"{config.env}-{config.controller}-seed{config.seed}-{stamp}"
-    return Path("runs") / name
+    task = config.task.title.replace(", ", "-")
+    return Path("runs") / f"{task}-seed{config.ppo.seed}-{stamp}"
+
+
+def seed_folders(config: TrainConfig, folder: Path) -> list[Path]:
+    """Where each seed's own results go: the run's folder itself where it has one."""
+    ppo = config.ppo
+    if ppo.num_seeds == 1:
+        return [folder]
+    numbers = range(ppo.seed, ppo.seed + ppo.num_seeds)
+    return [folder / SEEDS / str(number) for number in numbers]
 
 
 def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
     """Prepare and lock the folder of a run; starts no JAX backend.
 
     Args:
-        config: Validated configuration.
+        config: Configuration.
 
     Returns:
         The folder, and its lock: the lock lasts as long as the file stays open.
@@ -94,28 +103,29 @@ def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
             configuration, cannot be written, or another process uses it.
     """
     trackers.check(config)
-    if config.resume:
-        folder = Path(config.resume)
-        different = differing_fields(load_config(folder / CONFIG), config)
+    run = config.run
+    if run.resume:
+        folder = Path(run.resume)
+        different = differing_fields(read_record(folder / CONFIG), config)
         if different:
             changes = ", ".join(f"{k}: {a} -> {b}" for k, (a, b) in different.items())
             raise ConfigError(f"a resumed run keeps its configuration ({changes})")
         newer = changed_software(folder)
-        if newer and not config.allow_changes:
+        if newer and not run.allow_changes:
             raise ConfigError(
                 f"not what this run was trained with: {', '.join(newer)}; "
                 "--allow_changes resumes it all the same, though not exactly"
             )
     else:
-        folder = Path(config.run_dir) if config.run_dir else default_run_dir(config)
+        folder = Path(run.run_dir) if run.run_dir else default_run_dir(config)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = _lock(folder)
     except OSError as error:
         raise ConfigError(f"cannot write to {folder}: {error.strerror}") from error
-    if not config.resume:
+    if not run.resume:
         others = sorted(p.name for p in folder.iterdir() if p.name != LOCK)
-        if others and not config.overwrite:
+        if others and not run.overwrite:
             raise ConfigError(
                 f"{folder} is not empty: --resume {folder} continues that run, "
                 "--overwrite deletes its results"
@@ -124,14 +134,6 @@ def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
             path = folder / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     return folder, lock
-
-
-def seed_folders(config: TrainConfig, folder: Path) -> list[Path]:
-    """Where each seed's own results go; the run's folder itself for a single seed."""
-    if config.num_seeds == 1:
-        return [folder]
-    numbers = range(config.seed, config.seed + config.num_seeds)
-    return [folder / SEEDS / str(number) for number in numbers]
 
 
 def _lock(folder: Path) -> IO[str]:

@@ -16,7 +16,7 @@ from tensorboardX.proto.event_pb2 import (
 from tensorboardX.summary import scalar
 
 from rmp_mjx.files import write_text
-from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.config import ConfigError, TrainConfig, defining
 
 OPTIONAL = ("wandb", "mlflow")
 """Trackers that need an extra. The name is the option, the module and the extra."""
@@ -43,7 +43,7 @@ def check(config: TrainConfig) -> None:
         ConfigError: With the command that installs the tracker.
     """
     for name in OPTIONAL:
-        if getattr(config, name) and importlib.util.find_spec(name) is None:
+        if getattr(config.run, name) and importlib.util.find_spec(name) is None:
             raise ConfigError(
                 f"--{name} needs a package that is not installed: "
                 f"pip install 'rmp-mjx[{name}]'"
@@ -62,9 +62,9 @@ def open_trackers(
         after: Policy steps that a resumed run keeps; None: it is new.
     """
     trackers: list[Tracker] = [TensorBoard(tensorboard, after)]
-    if config.wandb:
+    if config.run.wandb:
         trackers.append(WeightsAndBiases(config, folder))
-    if config.mlflow:
+    if config.run.mlflow:
         trackers.append(MLflow(config, folder))
     return trackers
 
@@ -112,12 +112,12 @@ class WeightsAndBiases:
         import wandb  # pyright: ignore[reportMissingImports]
 
         self._run = wandb.init(
-            project=config.wandb,
+            project=config.run.wandb,
             name=folder.name,
             id=_remembered(folder / "wandb_run", lambda: uuid.uuid4().hex),
             resume="allow",
             dir=str(folder),
-            config=dataclasses.asdict(config),
+            config=flat(config),
         )
 
     def add(self, steps: int, values: Values) -> None:
@@ -137,9 +137,9 @@ class MLflow:
         import mlflow  # pyright: ignore[reportMissingImports]
 
         def create() -> str:
-            experiment = mlflow.set_experiment(config.mlflow).experiment_id
+            experiment = mlflow.set_experiment(config.run.mlflow).experiment_id
             run = client.create_run(experiment, run_name=folder.name)
-            for name, value in dataclasses.asdict(config).items():
+            for name, value in flat(config).items():
                 client.log_param(run.info.run_id, name, value)
             return run.info.run_id
 
@@ -156,6 +156,11 @@ class MLflow:
         """Mark the run as finished, stopped or failed."""
         status = {0: "FINISHED", 1: "FAILED"}.get(exit_code, "KILLED")
         self._client.set_terminated(self._id, status)
+
+
+def flat(config: TrainConfig) -> dict[str, object]:
+    """All options by name."""
+    return {**defining(config.record()), **dataclasses.asdict(config.run)}
 
 
 def _remembered(path: Path, make: Callable[[], str]) -> str:

@@ -1,6 +1,5 @@
 """Checks of every iteration: non-finite numbers, and contacts that were not read."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -33,7 +32,7 @@ class Watch:
         """Nothing has happened yet.
 
         Args:
-            config: Validated configuration.
+            config: Configuration.
             folder: Run folder.
             note: Called with one line for each kind of finding, once.
         """
@@ -50,7 +49,7 @@ class Watch:
 
     def abort_reason(self, rows: Sequence[Row]) -> str | None:
         """Why training must stop after an iteration; None: it can continue."""
-        config = self._config
+        config = self._config.ppo
         updates = config.num_updates_per_batch * config.num_minibatches
         for row in rows:
             lost = int(row["nonfinite_envs"] or 0)
@@ -83,15 +82,15 @@ class Watch:
             )
         for k, row in enumerate(rows if fault else ()):
             if row["nonfinite_envs"]:
-                self._dump(row, k, seeds.of_seed(fault, k, self._config))
+                self._dump(row, k, seeds.of_seed(fault, k, self._config.ppo))
 
     def _dump(self, row: Row, index: int, fault: faults.Fault) -> None:
         """Write the first few faults for a replay."""
         config = self._config
         room = MAX_DUMPS - len(list(self._folder.glob("*.npz")))
-        seed = config.seed + index
+        seed = config.ppo.seed + index
         about = {
-            "config": dataclasses.asdict(config),
+            "config": config.record(),
             "iteration": row["iteration"],
             "seed": seed,
         }

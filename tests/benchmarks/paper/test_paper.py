@@ -35,9 +35,10 @@ from benchmarks.paper import (
 )
 from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
 from benchmarks.paper.store import Store
+from envs.cli import make_config
 from envs.types import METRICS
 from rmp_mjx.pytree import Pytree
-from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import run_folder, saving
 from rmp_mjx.training.runs.loop import load_agent
 from tests.training.toys import ToyState
@@ -80,7 +81,7 @@ class Arm(Pytree):
 
 TINY = dataclasses.replace(
     PRESETS["smoke"],
-    training=TrainConfig(
+    training=make_config(
         num_envs=8,
         unroll_length=8,
         num_minibatches=2,
@@ -91,7 +92,7 @@ TINY = dataclasses.replace(
         eval_episodes=0,
         video=False,
     ),
-    env_options=(),
+    options={},
     episodes=20,
     other_episodes=5,
 )
@@ -103,7 +104,7 @@ def toy():
     """Every task is the toy; nothing is drawn; events are not looked into."""
     risk = {"vices": 0.3, "rmp_vices": 0.02}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tasks, "load", lambda config: Arm(risk[config.controller]))
+        patch.setattr(tasks, "load", lambda config: Arm(risk[config.task.controller]))
         patch.setattr(failures, "describe", lambda env, results, tape: [EVENT])
         patch.setattr(pictures, "save", lambda *args: None)
         deployment._world.cache_clear()
@@ -161,10 +162,10 @@ def test_presets_hold_to_the_papers_protocol():
     """1.5e6 steps, 64-64; both controllers with the same settings."""
     for name, seeds in (("cpu", 5), ("full", 10)):
         preset = PRESETS[name]
-        assert (preset.seeds, preset.training.num_timesteps) == (seeds, 1_500_000)
-        assert preset.training.hidden_sizes == (64, 64)
+        assert (preset.seeds, preset.training.run.num_timesteps) == (seeds, 1_500_000)
+        assert preset.training.ppo.hidden_sizes == (64, 64)
         ours, base = (preset.config(Cell("door", v, 0)) for v in ("rmp_vices", "vices"))
-        assert dataclasses.replace(ours, controller="vices") == base
+        assert ours.replace(controller="vices") == base
 
 
 @pytest.mark.parametrize(
@@ -252,7 +253,7 @@ def test_a_stopped_grid_goes_on_to_the_same_bits(grid, toy, tmp_path, monkeypatc
     wanted = [cell]
     assert work.run(place, TINY, wanted, QUIET) == 128 + signal.SIGTERM
     assert 0 < max(saves) < 4
-    assert not place.holds(cells.definition(TINY.config(cell)), store.TRAINING, cell)
+    assert not place.holds(cells.definition(TINY, cell), store.TRAINING, cell)
     assert work.run(Store(tmp_path), TINY, wanted, QUIET) == 0
     values = [
         measures.of(
@@ -273,7 +274,7 @@ def test_a_stopped_grid_goes_on_to_the_same_bits(grid, toy, tmp_path, monkeypatc
 def test_a_run_whose_checkpoints_are_lost_begins_anew(grid, toy, tmp_path):
     cell, place = Cell("push", "rmp_vices", 1), Store(tmp_path)
     folder = place.folder / "runs" / cell.file
-    config = dataclasses.replace(TINY.config(cell), run_dir=str(folder))
+    config = TINY.config(cell).replace(run_dir=str(folder))
     _, lock = run_folder.open_run(config)
     run_folder.describe(folder, config)
     damaged = folder / run_folder.CHECKPOINTS / "2"

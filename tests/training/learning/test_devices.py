@@ -8,7 +8,7 @@ import sys
 import jax
 import pytest
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices
 
 COUNT_CODE = """
@@ -42,7 +42,7 @@ def test_as_many_devices_are_used_as_share_the_groups_equally(root):
 def test_groups_divide_environments_and_minibatches(
     num_envs, unroll_length, num_minibatches, groups
 ):
-    config = TrainConfig(
+    config = PPOConfig(
         num_envs=num_envs, unroll_length=unroll_length, num_minibatches=num_minibatches
     )
     assert config.groups == groups
@@ -65,15 +65,14 @@ runtime.configure()
 import jax, numpy as np
 import envs
 from rmp_mjx.training.learning import seeds
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 
 env = envs.load("trajectory", controller="vices", physics="mujoco", episode_length=6)
 
 def trained(num_devices, num_seeds):
-    config = TrainConfig(num_envs=8, unroll_length=4, num_minibatches=2,
-                         num_updates_per_batch=2, num_seeds=num_seeds,
-                         num_devices=num_devices)
-    programs = seeds.programs(env, config)
+    config = PPOConfig(num_envs=8, unroll_length=4, num_minibatches=2,
+                       num_updates_per_batch=2, num_seeds=num_seeds)
+    programs = seeds.programs(env, config, num_devices)
     assert programs.mesh.size == num_devices
     state = programs.place(programs.init(seeds.keys(config)))
     for _ in range(3):

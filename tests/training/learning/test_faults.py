@@ -8,22 +8,21 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import run_folder, watch
 from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import train
 from tests.training import toys
-from tests.training.conftest import SMALL, bits
+from tests.training.conftest import SMALL, bits, small
 
-CONFIG = TrainConfig(**SMALL)
+CONFIG = small()
 ITERATIONS = 4
 
 
 def iterations(env):
     """State, and the count of bad steps, after a few iterations."""
-    ppo = make_ppo(env, CONFIG)
+    ppo = make_ppo(env, CONFIG.ppo)
     state = jax.jit(ppo.init)(jax.random.key(0))
     iterate, bad = jax.jit(ppo.iterate), 0
     for _ in range(ITERATIONS):
@@ -59,7 +58,7 @@ def test_without_poison_it_learns_something_else(flagged):
 def poisoned(tmp_path_factory):
     """A run with bad steps: its folder and what it said."""
     folder = tmp_path_factory.mktemp("poisoned") / "run"
-    config = TrainConfig(**SMALL, num_timesteps=64 * 8, run_dir=str(folder))
+    config = small(num_timesteps=64 * 8, run_dir=str(folder))
     folder, lock = run_folder.open_run(config)
     text = io.StringIO()
     with lock:
@@ -88,7 +87,7 @@ def test_a_written_step_becomes_bad_again(poisoned):
         assert np.isfinite(state.obs).all()
         assert np.isnan(env.step(state, action).obs).any()
         said = faults.about(path)
-        assert said["config"]["env"] == "counter"
+        assert said["config"]["task"]["env"] == "counter"
         assert said["iteration"] >= 1 and 0 <= said["lane"] < SMALL["num_envs"]
 
 
@@ -117,7 +116,7 @@ def test_contacts_that_were_not_read_are_said_once(tmp_path):
 
 def test_training_goes_on_with_some_skipped_updates_and_not_without_any_other(tmp_path):
     watching = watch.Watch(CONFIG, tmp_path, pytest.fail, Commands())
-    updates = CONFIG.num_updates_per_batch * CONFIG.num_minibatches
+    updates = CONFIG.ppo.num_updates_per_batch * CONFIG.ppo.num_minibatches
     some, all_of_them = (
         row(**{"learning/skipped_updates": float(n)}) for n in (updates - 1, updates)
     )

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning.ppo import make_ppo
 from tests.training import toys
 
-CONFIG = TrainConfig(
+CONFIG = PPOConfig(
     num_envs=32,
     unroll_length=8,
     num_minibatches=4,

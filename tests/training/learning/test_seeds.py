@@ -8,14 +8,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluation.evaluate import over_seeds
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import metrics, run_folder
 from rmp_mjx.training.runs.loop import load_agent
 from tests.training import toys
-from tests.training.conftest import ITERATIONS, SMALL, bits, run
+from tests.training.conftest import ITERATIONS, bits, run, small
 
 FIRST, COUNT = 3, 3
 
@@ -23,7 +22,7 @@ FIRST, COUNT = 3, 3
 @functools.cache
 def trained(seed, count):
     """State and last learning metrics of `count` seeds after a few iterations."""
-    config = TrainConfig(**SMALL, seed=seed, num_seeds=count)
+    config = small(seed=seed, num_seeds=count).ppo
     programs = seeds.programs(toys.Counter(), config)
     state = programs.place(programs.init(seeds.keys(config)))
     for _ in range(ITERATIONS):
@@ -58,7 +57,7 @@ def test_the_seeds_differ_from_each_other():
 
 def test_resets_stay_a_branch_for_several_seeds():
     """As a select, every step of every environment would pay for a reset."""
-    config = TrainConfig(**SMALL, num_seeds=2)
+    config = small(num_seeds=2).ppo
     ppo = make_ppo(toys.Counter(), config)
     program = jax.make_jaxpr(jax.vmap(ppo.gather))(seeds.shapes(ppo, config))
     assert " cond[" in str(program)
@@ -84,7 +83,7 @@ def test_every_seed_has_its_rows(several):
 def test_a_resumed_run_of_several_seeds_is_bit_identical(several, tmp_path):
     folder, config = several
     other = tmp_path / "interrupted"
-    half = config.steps_per_iteration * ITERATIONS // 2
+    half = config.ppo.steps_per_iteration * ITERATIONS // 2
     run(other, num_seeds=2, num_timesteps=half)
     run(other, num_seeds=2, run_dir=None, resume=str(other))
     rows, reference = (

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import value_scale
 from rmp_mjx.training.learning.rollout import Transition
 from rmp_mjx.training.learning.targets import make_batch
@@ -37,7 +37,7 @@ def data():
 def test_the_first_batch_is_normalized_by_its_own_moments(data):
     values = jnp.full((T, B), 4.0)
     batch, scale, metrics = make_batch(
-        TrainConfig(), data, values, jnp.full((T, B), 1e3), value_scale.init()
+        PPOConfig(), data, values, jnp.full((T, B), 1e3), value_scale.init()
     )
     counted = np.asarray(data.weight) > 0
     reward = np.asarray(data.reward)[counted]
@@ -56,7 +56,7 @@ def test_right_values_explain_all_variance_and_constant_ones_none(data):
     mean = weighted_mean(data.reward, data.weight)
     for values, share in ((data.reward, 1.0), (mean, 0.0)):
         values = jnp.broadcast_to(values, (T, B))
-        _, _, metrics = make_batch(TrainConfig(), data, values, nothing, scale)
+        _, _, metrics = make_batch(PPOConfig(), data, values, nothing, scale)
         found = float(metrics["explained_variance"])
         assert found == pytest.approx(share, abs=1e-5)
 

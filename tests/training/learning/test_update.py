@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from brax.training.acme import running_statistics
 
-from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices
 from rmp_mjx.training.learning.learner import make_optimizers
 from rmp_mjx.training.learning.loss import Batch
@@ -25,7 +25,7 @@ from tests.training.conftest import bits
 
 OBS, ACTION = 3, 2
 GROUPS, ROWS = 2, 8
-CONFIG = TrainConfig(
+CONFIG = PPOConfig(
     num_minibatches=4, num_updates_per_batch=3, hidden_sizes=(4,), target_kl=0.0
 )
 NORMALIZER = functools.partial(running_statistics.init_state, np.zeros(OBS))

@@ -11,17 +11,16 @@ from rich.console import Console
 
 from rmp_mjx import runtime
 from rmp_mjx.training.runs import distributed
-from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.runs.loop import train
 from tests.training import toys
-from tests.training.conftest import SMALL
+from tests.training.conftest import small
 
 
 def main() -> int:
     asked = json.loads(sys.argv[1])
     distributed.join(*asked.pop("process"))
     runtime.configure()
-    config = TrainConfig(**{**SMALL, **asked})
+    config = small(**asked)
     folder, lock = distributed.open_run(config)
     with lock:
         return train(toys.Counter(), config, folder, Console(quiet=True)).exit_code

@@ -13,17 +13,17 @@ from rich.console import Console
 
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs import loop as train_module
-from rmp_mjx.training.config import ConfigError, TrainConfig, load_config
+from rmp_mjx.training.config import ConfigError, config_of, read_record
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.stopping import StopRequest
 from tests.training import toys
-from tests.training.conftest import ITERATIONS, SMALL, bits, newest_state, run
+from tests.training.conftest import ITERATIONS, bits, newest_state, run, small
 
 
 def test_a_run_leaves_its_configuration_versions_metrics_and_checkpoints(finished):
     folder, result, config = finished
     assert (result.iterations, result.exit_code) == (ITERATIONS, 0)
-    assert load_config(folder / run_folder.CONFIG) == config
+    assert config_of(read_record(folder / run_folder.CONFIG), lambda task: toys.Options(**task))== config
     (versions,) = json.loads((folder / run_folder.VERSIONS).read_text())
     assert {"python", "jax", "brax", "mujoco", "device", "command"} <= set(versions)
     rows = pl.read_parquet(folder / run_folder.METRICS)
@@ -86,7 +86,7 @@ def test_a_run_that_becomes_nonfinite_stops_and_names_the_checkpoints(tmp_path):
         def step(self, state, action):
             return super().step(state, action).replace(reward=jax.numpy.nan)
 
-    config = TrainConfig(**SMALL, num_timesteps=128, run_dir=str(tmp_path / "bad"))
+    config = small(num_timesteps=128, run_dir=str(tmp_path / "bad"))
     folder, lock = run_folder.open_run(config)
     with lock, pytest.raises(train_module.TrainingFailure, match="non-finite"):
         train_module.train(Broken(), config, folder, Console(quiet=True))
@@ -171,15 +171,15 @@ def test_a_folder_with_results_is_refused_unless_they_may_go(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     (tmp_path / "mine.txt").write_text("keep")
     with pytest.raises(ConfigError, match="--resume"):
-        run_folder.open_run(TrainConfig(run_dir=str(tmp_path)))
-    _, lock = run_folder.open_run(TrainConfig(run_dir=str(tmp_path), overwrite=True))
+        run_folder.open_run(small(run_dir=str(tmp_path)))
+    _, lock = run_folder.open_run(small(run_dir=str(tmp_path), overwrite=True))
     lock.close()
     assert not (tmp_path / "config.json").exists()
     assert (tmp_path / "mine.txt").read_text() == "keep"
 
 
 def test_two_runs_cannot_share_a_folder(tmp_path):
-    config = TrainConfig(run_dir=str(tmp_path))
+    config = small(run_dir=str(tmp_path))
     _, lock = run_folder.open_run(config)
     with pytest.raises(ConfigError, match=f"in use by process {os.getpid()}"):
         run_folder.open_run(config)
@@ -190,13 +190,11 @@ def test_two_runs_cannot_share_a_folder(tmp_path):
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot write"):
-        run_folder.open_run(TrainConfig(run_dir=str(tmp_path / "file" / "run")))
+        run_folder.open_run(small(run_dir=str(tmp_path / "file" / "run")))
 
 
 def test_resuming_with_another_configuration_names_the_fields(finished):
     folder, _, config = finished
-    changed = TrainConfig(
-        **{**vars(config), "resume": str(folder), "run_dir": None, "num_envs": 16}
-    )
+    changed = config.replace(resume=str(folder), run_dir=None, num_envs=16)
     with pytest.raises(ConfigError, match=r"num_envs: 8 -> 16"):
         run_folder.open_run(changed)

@@ -115,9 +115,10 @@ READ_ONLY = """
 import sys
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import ConfigError, TrainConfig
+from tests.training import toys
 
 try:
-    run_folder.open_run(TrainConfig(run_dir=f"{sys.argv[1]}/run"))
+    run_folder.open_run(TrainConfig(toys.Options()).replace(run_dir=f"{sys.argv[1]}/run"))
 except ConfigError as error:
     sys.stdout.write(str(error))
 """

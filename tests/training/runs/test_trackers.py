@@ -9,9 +9,10 @@ from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from rmp_mjx.training.runs import run_folder, trackers
-from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.trackers import TensorBoard
+from tests.training.conftest import small
 
 ROW = {"iteration": 1, "steps": 10, "episode/return": 2.5, "episode/success": None}
 
@@ -103,7 +104,7 @@ def records(file):
 
 
 def test_tensorboard_shows_each_value_at_its_policy_step(tmp_path):
-    log(tmp_path, TrainConfig())
+    log(tmp_path, small())
     (found,) = (e for e in events(tmp_path / "tb") if e.HasField("summary"))
     (value,) = found.summary.value
     assert (found.step, value.tag, value.simple_value) == (10, "episode/return", 2.5)
@@ -125,7 +126,7 @@ def test_a_tracker_that_is_not_installed_is_refused_before_anything_starts(
     name, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(trackers.importlib.util, "find_spec", lambda name: None)
-    config = TrainConfig(run_dir=str(tmp_path / "run"), **{name: "project"})
+    config = small(run_dir=str(tmp_path / "run"), **{name: "project"})
     with pytest.raises(ConfigError, match=rf"pip install 'rmp-mjx\[{name}\]'"):
         run_folder.open_run(config)
     assert not (tmp_path / "run").exists()
@@ -135,17 +136,17 @@ def test_weights_and_biases_gets_the_rows_and_a_resumed_run_its_old_entry(
     tmp_path, fake
 ):
     fake("wandb", WANDB)
-    config = TrainConfig(wandb="arm")
+    config = small(wandb="arm")
     log(tmp_path, config)
     log(tmp_path, config, after=10)
     (file,) = tmp_path.glob("arm-*")
     lines = file.read_text().splitlines()
-    assert lines == ["allow trajectory", "10 {'episode/return': 2.5}", "exit 0"] * 2
+    assert lines == ["allow counter", "10 {'episode/return': 2.5}", "exit 0"] * 2
 
 
 def test_mlflow_gets_the_rows_and_a_resumed_run_its_old_entry(tmp_path, fake):
     fake("mlflow", MLFLOW)
-    config = TrainConfig(mlflow="arm")
+    config = small(mlflow="arm")
     log(tmp_path, config)
     log(tmp_path, config, after=10)
     import mlflow
@@ -154,7 +155,7 @@ def test_mlflow_gets_the_rows_and_a_resumed_run_its_old_entry(tmp_path, fake):
     assert [call for call in said if call[0] == "create_run"] == [
         ("create_run", "id of arm", tmp_path.name)
     ]
-    assert ("log_param", "run7", "env", "trajectory") in said
+    assert ("log_param", "run7", "env", "counter") in said
     assert said.count(("log_metric", "run7", "episode/return", 2.5, 10)) == 2
     assert said[-1] == ("set_terminated", "run7", "FINISHED")
 
@@ -167,7 +168,7 @@ def test_weights_and_biases_itself_keeps_the_rows_of_a_run_and_its_continuation(
 
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    config = TrainConfig(wandb="arm")
+    config = small(wandb="arm")
     log(tmp_path, config)
     log(tmp_path, config, after=10, rows=[ROW | {"steps": 20}])
     files = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
@@ -187,14 +188,14 @@ def test_mlflow_itself_keeps_the_rows_of_a_run_and_its_continuation(
         "mlflow", reason="mlflow is not installed (extra 'mlflow')"
     )
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/tracked.db")
-    config = TrainConfig(mlflow="arm")
+    config = small(mlflow="arm")
     log(tmp_path, config)
     log(tmp_path, config, after=10, rows=[ROW | {"steps": 20}])
     client = mlflow.MlflowClient()
     experiment = client.get_experiment_by_name("arm")
     (run,) = client.search_runs([experiment.experiment_id])
     assert run.info.status == "FINISHED"
-    assert run.data.params["env"] == "trajectory"
+    assert run.data.params["env"] == "counter"
     history = client.get_metric_history(run.info.run_id, "episode/return")
     assert [(m.step, m.value) for m in history] == [(10, 2.5), (20, 2.5)]
 
@@ -203,7 +204,7 @@ def test_a_tracker_that_fails_is_left_alone_and_training_goes_on(tmp_path, fake)
     broken = WANDB.replace("self.file.open", "raise ConnectionError('lost')  #", 1)
     fake("wandb", broken)
     rows = [ROW, ROW | {"iteration": 2, "steps": 20}]
-    said = log(tmp_path, TrainConfig(wandb="arm"), rows=rows)
+    said = log(tmp_path, small(wandb="arm"), rows=rows)
     assert said.count("WeightsAndBiases failed; training goes on: lost") == 1
     steps = [e.step for e in events(tmp_path / "tb") if e.HasField("summary")]
     assert steps == [10, 20]

@@ -1,0 +1,174 @@
+"""Flags of the command line, typed by the task that is named.
+
+Parsing takes two steps: `--env` (or the run that is named) says which task, and the
+task's options are then flags like any others.
+"""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+import envs
+from envs.options import Options
+from rmp_mjx.training.config import ConfigError, TrainConfig, config_of, read_record
+from rmp_mjx.training.runs.run_folder import CONFIG
+
+DEFAULT = "trajectory"
+"""Task where none is named."""
+
+Task = TypeVar("Task", bound=Options)
+Parsed = TypeVar("Parsed")
+EnvName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(envs.names()) + "}")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Processes:
+    """Several processes that train one run together."""
+
+    coordinator: str | None = None
+    """HOST:PORT of process 0; under Slurm's srun these three are found out."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    num_processes: int | None = None
+    """Number of processes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions(TrainConfig[Task]):
+    """Train a policy with PPO (Schulman et al., 2017), or a grid of policies."""
+
+    env: EnvName = DEFAULT
+    """Task to learn. Its own options are below; `--env NAME --help` shows another's."""
+    envs: str | None = None
+    """Tasks of a grid, joined by commas: one run for each of them and each of
+    `controllers`, one after the other."""
+    controllers: str | None = None
+    """Controllers of a grid, joined by commas."""
+    processes: Processes = Processes()
+    """Several processes that train one run together."""
+
+    @property
+    def config(self) -> TrainConfig[Task]:
+        """The options of a run."""
+        return TrainConfig(self.task, self.ppo, self.run, self.trainer)
+
+
+def train_flags(
+    env: str,
+    args: Sequence[str] | None,
+    saved: TrainConfig | None = None,
+    quiet: bool = False,
+) -> TrainOptions:
+    """Parse the flags of a training run; what is not given is as it was saved."""
+    kind = envs.task(env).Options
+    config = saved or TrainConfig(kind())
+    run = dataclasses.replace(
+        config.run, resume=None, run_dir=None, overwrite=False, allow_changes=False
+    )
+    default = TrainOptions(config.task, config.ppo, run, config.trainer, env=env)
+    return parse(TrainOptions[kind], args, default, env, quiet)
+
+
+def parse(
+    kind: type[Parsed],
+    args: Sequence[str] | None,
+    default: Any = None,
+    env: str = "",
+    quiet: bool = False,
+) -> Parsed:
+    """Parse flags into a dataclass; `--num_envs` and `--num-envs` are the same.
+
+    Exits with code 2 and a message where the flags are wrong.
+
+    Args:
+        kind: The dataclass.
+        args: Command line; None: this process's.
+        default: What is not given.
+        env: Task whose options they are, for the messages.
+        quiet: Exit without a message.
+    """
+    given = {} if default is None else {"default": default}
+    script = Path(sys.argv[0]).name
+    return tyro.cli(
+        tyro.conf.OmitArgPrefixes[kind],
+        prog=f"{script} --env {env}" if env else None,
+        args=args,
+        use_underscores=True,
+        console_outputs=not quiet,
+        **given,
+    )
+
+
+def named(args: Sequence[str] | None, *names: str) -> dict[str, str | None]:
+    """Values of the flags that decide which others there are.
+
+    Raises:
+        ConfigError: Flags of an earlier version.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in names:
+        parser.add_argument(f"--{name}")
+    parser.add_argument("--env_options", "--env-options", nargs="*")
+    found = vars(parser.parse_known_args(args)[0])
+    options = found.pop("env_options")
+    if options is not None:
+        flags = [f"--{option.replace('=', ' ')}" for option in options]
+        raise ConfigError(
+            "--env_options is gone: options of the task are flags of their own; write "
+            + (" ".join(flags) or "--obstacles 2")
+        )
+    return found
+
+
+def from_record(record: Mapping[str, Any]) -> TrainConfig[Options]:
+    """A configuration from its JSON record; missing fields take defaults.
+
+    Records of version 0.1 were flat: their values are parsed as flags.
+
+    Raises:
+        ConfigError: It has unknown fields, or values that cannot be run.
+    """
+    if "ppo" in record:
+        return config_of(record, lambda task: envs.make_options(**task))
+    try:
+        return train_flags(record["env"], _flags(record), quiet=True).config
+    except SystemExit as error:
+        raise ConfigError("no configuration of this version, nor of 0.1") from error
+
+
+def _flags(record: Mapping[str, Any]) -> list[str]:
+    """The flags that say what a record of version 0.1 says."""
+    place = ("env", "env_options", "run_dir", "resume", "overwrite", "allow_changes")
+    pairs = {name: value for name, value in record.items() if name not in place}
+    pairs |= dict(option.split("=") for option in record["env_options"])
+    flags = []
+    for name, value in pairs.items():
+        if str(value).lower() in ("true", "false"):
+            flags.append(
+                f"--{name}" if str(value).lower() == "true" else f"--no_{name}"
+            )
+        elif value is not None:
+            values = value if isinstance(value, list) else [value]
+            flags += [f"--{name}", *map(str, values)]
+    return flags
+
+
+def load_config(folder: Path) -> TrainConfig[Options]:
+    """The configuration that a run was started with.
+
+    Raises:
+        ConfigError: It is no run folder, or its configuration cannot be read.
+    """
+    path = folder / CONFIG
+    record = read_record(path)
+    try:
+        return from_record(record)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} cannot be read as a configuration: {error}") from (
+            error
+        )
