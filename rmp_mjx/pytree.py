@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
-from typing import Any, Self, dataclass_transform
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax import Array
 from jax.core import Tracer
+
+# A JAX array, a tracer or a NumPy array. Constants stay float64 NumPy arrays until they
+# are traced, so that they serve any precision.
+if TYPE_CHECKING:
+    from typing import Any as Constant
+else:
+    Constant = Array | np.ndarray
+
+_WIDTH = 88
 
 
 @dataclass_transform(
@@ -18,36 +30,43 @@ from jax.core import Tracer
 class Pytree:
     """A frozen dataclass whose fields are pytree nodes.
 
-    Fields are array leaves or further pytrees; `flax.struct.field(pytree_node=False)`
-    marks a static one. Subclasses need no decorator. Two objects are equal if they have
-    the same structure and the same leaves, so that `jax.jit`, `jax.vmap` and `jax.grad`
+    Fields are arrays, numbers or further pytrees. `struct.field(pytree_node=False)`
+    marks a static field, whose value must be hashable. Subclasses need no decorator.
+
+    Two objects are equal if they have the same class, structure and static fields, and
+    leaves of the same type, shape and bits. So `jax.jit`, `jax.vmap` and `jax.lax.scan`
     take a callable pytree like any function, and compile it once for equal objects.
 
-    JAX puts whatever it likes into the leaves of a tree (batches, tracers, None). So a
-    tree is put together again without `__init__`, which checks what a user passes.
+    `repr` leaves out the fields that have their default value, and shows an array of
+    more than four entries by dtype and shape.
+
+    JAX puts what it likes into the leaves of a tree: batches, axes, placeholders. So it
+    rebuilds a tree without `__init__`, and the fields' annotations say what a user
+    passes.
     """
+
+    _static: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         this: Any = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
-        names: dict[bool, list[str]] = {True: [], False: []}
-        for field in dataclasses.fields(this):
-            names[field.metadata.get("pytree_node", True)].append(field.name)
-        data, static = names[True], names[False]
+        fields = dataclasses.fields(this)
+        data = [f.name for f in fields if f.metadata.get("pytree_node", True)]
+        static = [f.name for f in fields if f.name not in data]
         keys = [jax.tree_util.GetAttrKey(name) for name in data]
+        children, constants = _values(data), _values(static)
+        this._static = tuple(static)
 
         def flatten(tree: Any) -> tuple[tuple, tuple]:
-            values = tree.__dict__
-            return tuple([values[k] for k in data]), tuple([values[k] for k in static])
+            return children(tree), constants(tree)
 
         def flatten_with_keys(tree: Any) -> tuple[tuple, tuple]:
-            children, rest = flatten(tree)
-            return tuple(zip(keys, children, strict=True)), rest
+            return tuple(zip(keys, children(tree), strict=True)), constants(tree)
 
-        def unflatten(rest: Iterable, children: Iterable) -> Any:
+        def unflatten(constants: tuple, children: Iterable[Any]) -> Any:
             tree = object.__new__(cls)
             tree.__dict__.update(zip(data, children, strict=True))
-            tree.__dict__.update(zip(static, rest, strict=True))
+            tree.__dict__.update(zip(static, constants, strict=True))
             return tree
 
         jax.tree_util.register_pytree_with_keys(
@@ -62,27 +81,53 @@ class Pytree:
     def __eq__(self, other: object) -> bool:
         if self is other:
             return True
-        if type(self) is not type(other):
+        if not isinstance(other, Pytree) or type(self) is not type(other):
             return NotImplemented
+        if hash(self) != hash(other):
+            return False
         mine, structure = jax.tree.flatten(self)
         others, other_structure = jax.tree.flatten(other)
         return structure == other_structure and all(map(_same, mine, others))
 
     def __hash__(self) -> int:
-        """Hash of the structure: equal objects have the same one."""
-        return hash((type(self), jax.tree.structure(self)))
+        """Hash of the structure and the static fields: equal objects share it.
+
+        Raises:
+            TypeError: A static field is not hashable.
+        """
+        constants = tuple(vars(self)[name] for name in self._static)
+        inner = jax.tree.leaves(vars(self), is_leaf=lambda x: isinstance(x, Pytree))
+        inner = tuple(hash(x) for x in inner if isinstance(x, Pytree))
+        try:
+            return hash((type(self), jax.tree.structure(self), inner, constants))
+        except TypeError as error:
+            raise TypeError(
+                f"a static field of {type(self).__name__} has an unhashable value "
+                f"({error}): make it a tuple, or a field that is a pytree node"
+            ) from error
 
     def __repr__(self) -> str:
-        """Fields by name; an array of more than four entries by dtype and shape."""
         this: Any = self
         fields = [
-            f"{f.name}={_show(getattr(self, f.name))}" for f in dataclasses.fields(this)
+            f"{field.name}={_show(getattr(self, field.name))}"
+            for field in dataclasses.fields(this)
+            if not _is_default(field, getattr(self, field.name))
         ]
         line = f"{type(self).__name__}({', '.join(fields)})"
-        if len(line) <= 88:
+        if len(line) <= _WIDTH and "\n" not in line:
             return line
         inner = ",\n".join("  " + field.replace("\n", "\n  ") for field in fields)
         return f"{type(self).__name__}(\n{inner},\n)"
+
+
+def _values(names: Sequence[str]) -> Callable[[Any], tuple]:
+    """A fast function of an object that gives these attributes as a tuple."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    if names:
+        name = names[0]
+        return lambda tree: (getattr(tree, name),)
+    return lambda tree: ()
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -91,16 +136,61 @@ def _same(a: Any, b: Any) -> bool:
         return True
     if isinstance(a, Tracer) or isinstance(b, Tracer):
         return False
+    kind = _kind(a)
+    if kind is None or kind != _kind(b):
+        return kind is None and bool(a == b)
+    if jnp.issubdtype(kind[0], jax.dtypes.prng_key):
+        a, b = jax.random.key_data(a), jax.random.key_data(b)
     a, b = np.asarray(a), np.asarray(b)
-    return a.dtype == b.dtype and a.shape == b.shape and bool(np.array_equal(a, b))
+    return a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def _kind(x: Any) -> tuple[Any, bool] | None:
+    """Dtype of a leaf, and whether it adapts to that of others; None for no number."""
+    if isinstance(x, (jax.Array, np.ndarray, np.generic)):
+        return x.dtype, bool(getattr(x, "weak_type", False))
+    if isinstance(x, (bool, int, float, complex)):
+        return np.dtype(type(x)), True
+    return None
+
+
+def _is_default(field: dataclasses.Field, value: Any) -> bool:
+    """Whether a field has the value that it has if none is given."""
+    if field.default_factory is not dataclasses.MISSING:
+        default = field.default_factory()
+    elif field.default is not dataclasses.MISSING:
+        default = field.default
+    else:
+        return False
+    if isinstance(default, Pytree):
+        return default == value
+    return _same(default, value)
+
+
+class _Text(str):
+    """A string that is its own `repr`."""
+
+    __slots__ = ()
+
+    __repr__ = str.__str__
 
 
 def _show(value: Any) -> str:
     """A field's value on a line, or a nested pytree on several."""
-    if isinstance(value, str) and len(value) > 60:
-        return f"<{len(value)} characters>"
-    if isinstance(value, (np.ndarray, jax.Array)):
-        if isinstance(value, Tracer) or value.size > 4:
-            return f"{value.dtype}{list(value.shape)}"
-        return str(np.asarray(value).tolist())
-    return repr(value)
+
+    def text(leaf: Any) -> _Text:
+        if isinstance(leaf, str) and len(leaf) > 60:
+            return _Text(f"<{len(leaf)} characters>")
+        if isinstance(leaf, Tracer):
+            return _Text(f"{leaf.dtype}{list(leaf.shape)}")
+        if isinstance(leaf, (np.ndarray, np.generic, jax.Array)):
+            if not 0 < leaf.size <= 4 or jnp.issubdtype(
+                leaf.dtype, jax.dtypes.prng_key
+            ):
+                return _Text(f"{leaf.dtype}{list(leaf.shape)}")
+            return _Text(np.array2string(np.asarray(leaf), separator=", "))
+        if callable(leaf) and not isinstance(leaf, Pytree):
+            return _Text(getattr(leaf, "__qualname__", repr(leaf)))
+        return _Text(repr(leaf))
+
+    return repr(jax.tree.map(text, value, is_leaf=lambda x: isinstance(x, Pytree)))
