@@ -190,6 +190,22 @@ def log_so3(R: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     return factor * v
 
 
+def ramp(
+    room: Float[Array, "*s"],
+    near: Float[Array, ""] | float,
+    far: Float[Array, ""] | float,
+) -> Float[Array, "*s"]:
+    """The share of the room that is lost: 0 from ``far`` on, 1 up to ``near``, linear.
+
+    Args:
+        room: Distances, any shape; may be infinite.
+        near: Distance at which all is lost, below ``far``.
+        far: Distance at which it begins.
+    """
+    inside = far - jnp.minimum(room, far)  # finite gradients at infinity
+    return jnp.minimum(inside / (far - near), 1.0)
+
+
 def orientation_error(
     R: Float[Array, "3 3"], R_des: Float[Array, "3 3"]
 ) -> Float[Array, " 3"]:
@@ -224,11 +240,3 @@ def speed_gate(speed: Float[Array, "*s"], sigma: Float[Array, ""] | float):
     Source: RMPflow (Cheng et al., 2018), joint-limit metric.
     """
     return -jnp.expm1(-0.5 * (speed / sigma) ** 2)
-
-
-def approach_gate(speed: Float[Array, "*s"], width: Float[Array, ""] | float):
-    """Smooth gate ``1 - sigmoid(speed / width)``: 1 when approaching (speed < 0).
-
-    Source: the directional gate of NVIDIA's Lula RMPflow.
-    """
-    return jax.nn.sigmoid(-speed / width)

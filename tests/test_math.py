@@ -147,13 +147,15 @@ def test_critical_damping_is_twice_the_root_with_finite_gradient_at_zero():
 def test_gates_are_zero_one_and_differentiable_at_their_ends():
     assert rmath.speed_gate(jnp.zeros(()), 0.1) == 0.0
     assert rmath.speed_gate(jnp.asarray(10.0), 0.1) == 1.0
-    assert rmath.approach_gate(jnp.asarray(-1.0), 0.01) == 1.0
-    assert rmath.approach_gate(jnp.asarray(0.0), 0.01) == 0.5
-    # 1e-30: sigmoid(-100) is 4e-44.
-    assert rmath.approach_gate(jnp.asarray(1.0), 0.01) < 1e-30
     for speed in (-1e3, 0.0, 1e3):
-        assert np.isfinite(jax.grad(rmath.approach_gate)(speed, 0.01))
         assert np.isfinite(jax.grad(rmath.speed_gate)(speed, 0.1))
+
+
+def test_a_ramp_goes_from_zero_at_its_far_end_to_one_at_its_near_end():
+    room = jnp.asarray([jnp.inf, 5.0, 3.0, 2.0, 1.0, -4.0])
+    np.testing.assert_allclose(rmath.ramp(room, 1.0, 3.0), [0, 0, 0, 0.5, 1, 1])
+    slope = jax.vmap(jax.grad(rmath.ramp), (0, None, None))(room, 1.0, 3.0)
+    assert np.isfinite(slope).all() and slope[3] == -0.5
 
 
 def _spd(rng, condition, n=7):

@@ -7,8 +7,11 @@ import abc
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rmp_mjx.pytree import Pytree
+from rmp_mjx.pytree import Constant, Pytree
 from rmp_mjx.rmp.algebra import RMP
+
+Param = Float[Constant, "..."] | float
+"""A leaf's parameter: a number, or an array that broadcasts against the coordinate."""
 
 
 class Leaf(Pytree, abc.ABC):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -48,8 +47,8 @@ class TaskMap(Pytree):
         return jnp.reshape(y, (-1,))
 
 
-class Pushed(Pytree):
-    """State of a child node, with the derivatives needed to pull a policy back."""
+class NodeState(Pytree):
+    """State of a child node, with the derivatives that the pullback needs."""
 
     x: Float[Array, " m"]
     """Child coordinate, (m,)."""
@@ -61,7 +60,9 @@ class Pushed(Pytree):
     """Curvature, (m,): the child's acceleration while the parent's is zero."""
 
 
-def pushforward(psi: TaskMap, x: Float[Array, " n"], xd: Float[Array, " n"]) -> Pushed:
+def pushforward(
+    psi: TaskMap, x: Float[Array, " n"], xd: Float[Array, " n"]
+) -> NodeState:
     r"""Push a state through a task map.
 
     $$
@@ -88,7 +89,7 @@ def pushforward(psi: TaskMap, x: Float[Array, " n"], xd: Float[Array, " n"]) -> 
         return jax.jvp(psi.at_time, (x, t), (xd, one))
 
     (y, yd), (_, ydd) = jax.jvp(velocity, (x, zero), (xd, one))
-    return Pushed(x=y, xd=yd, J=jax.jacfwd(psi)(x), Jdot_qd=ydd)
+    return NodeState(x=y, xd=yd, J=jax.jacfwd(psi)(x), Jdot_qd=ydd)
 
 
 def _identity(x: Array) -> Array:
@@ -98,34 +99,3 @@ def _identity(x: Array) -> Array:
 def identity_map() -> TaskMap:
     """The task map ``y = x``."""
     return TaskMap(fn=_identity)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Composition:
-    """``outer(inner(x))`` as a hashable function of (params, x)."""
-
-    outer: Callable[..., Array]
-    inner: Callable[..., Array]
-
-    def __call__(self, params: tuple[Any, Any], x: Array) -> Array:
-        outer_params, inner_params = params
-        y = TaskMap(self.inner, inner_params)(x)
-        return TaskMap(self.outer, outer_params)(y)
-
-
-def compose(outer: TaskMap, inner: TaskMap) -> TaskMap:
-    """The task map ``x -> outer(inner(x))``, parameters and their rates included."""
-    params_dot = None
-    if outer.params_dot is not None or inner.params_dot is not None:
-        params_dot = (_rates(outer), _rates(inner))
-    return TaskMap(
-        fn=_Composition(outer.fn, inner.fn),
-        params=(outer.params, inner.params),
-        params_dot=params_dot,
-    )
-
-
-def _rates(psi: TaskMap) -> Any:
-    if psi.params_dot is None:
-        return jax.tree.map(lambda p: 0.0 * p, psi.params)
-    return psi.params_dot

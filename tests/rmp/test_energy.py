@@ -10,6 +10,7 @@ from rmp_mjx.rmp import leaves
 from rmp_mjx.rmp.algebra import resolve
 from rmp_mjx.rmp.taskmap import TaskMap, identity_map
 from rmp_mjx.rmp.tree import Node, evaluate
+from tests.rmp.outside import Drag, GeodesicBarrier
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -30,12 +31,12 @@ def _distance(x):
 
 def _system(damping):
     """Attractor, obstacle and unit inertia: every leaf is a GDS."""
-    barrier = leaves.GDSCollision(
+    barrier = GeodesicBarrier(
         mu=MU, eps=EPS, eta=damping, alpha=ALPHA, r=R_MAX, cap=float("inf")
     )
     attractor = leaves.PositionAttractor(jnp.asarray(TARGET), KP, kd=damping)
     tip = Node(TaskMap(_tip), (attractor, Node(TaskMap(_distance), (barrier,))))
-    return Node(identity_map(), (leaves.Damping(damping, 1.0), tip))
+    return Node(identity_map(), (Drag(damping, 1.0), tip))
 
 
 def _energy(q, qd):

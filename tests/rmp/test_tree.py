@@ -12,8 +12,9 @@ import pytest
 from rmp_mjx.math import exp_so3, safe_norm
 from rmp_mjx.rmp import leaves
 from rmp_mjx.rmp.algebra import resolve
-from rmp_mjx.rmp.taskmap import TaskMap, compose, identity_map
+from rmp_mjx.rmp.taskmap import TaskMap, identity_map
 from rmp_mjx.rmp.tree import Node, Siblings, evaluate
+from tests.rmp.outside import Drag, GeodesicBarrier
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -42,6 +43,10 @@ def _position(frame):
     return frame[9:]
 
 
+def _tip(q):
+    return _position(_frame(q))
+
+
 def _orientation(frame):
     return frame[:9]
 
@@ -67,7 +72,7 @@ def _spheres(rng, count):
 
 def _obstacles(rng):
     barrier = leaves.Barrier(mu=0.1, r=3.0, eps=0.3)
-    gds = leaves.GDSCollision(mu=0.1, eps=0.1, alpha=0.3)
+    gds = GeodesicBarrier(mu=0.1, eps=0.1, alpha=0.3)
     spheres = TaskMap(_distance, _spheres(rng, 2), _spheres(rng, 2))
     return Siblings(Node(spheres, (barrier, gds)))
 
@@ -76,7 +81,7 @@ def _joint_leaves():
     lower = jnp.asarray([-1.0, -jnp.inf, -2.0])
     upper = jnp.asarray([1.0, jnp.inf, jnp.inf])
     posture = leaves.Posture(jnp.zeros(N), weight=0.3)
-    return posture, leaves.JointLimitBarrier(lower, upper), leaves.VelocityCap(0.8)
+    return posture, leaves.JointLimitBarrier(lower, upper), Drag(2.0, 0.3)
 
 
 def _tree():
@@ -90,7 +95,7 @@ def _tree():
     kp = jnp.asarray([50.0, 80.0, 20.0])
     position = leaves.PositionAttractor(jnp.asarray([0.4, 0.2, 0.9]), kp)
     orientation = leaves.OrientationAttractor(R_des, kp)
-    axis = leaves.AxisTarget(jnp.asarray([1.0, 0.0, 1.0]))
+    axis = leaves.PositionAttractor(jnp.asarray([0.6, 0.0, 0.8]), 100.0)
     end = Node(
         TaskMap(_frame),
         (
@@ -106,7 +111,7 @@ def _tree():
 def _small_tree():
     position = leaves.PositionAttractor(jnp.asarray([0.4, 0.2, 0.9]), 100.0)
     end = Node(
-        compose(TaskMap(_position), TaskMap(_frame)),
+        TaskMap(_tip),
         (position, _obstacles(np.random.default_rng(0))),
     )
     return Node(identity_map(), (*_joint_leaves(), end))
@@ -285,27 +290,28 @@ def test_giving_each_child_its_own_node_changes_nothing(small, states, run):
 
 def test_splitting_an_edge_in_two_changes_nothing(states, run):
     rng = np.random.default_rng(3)
-    position = compose(TaskMap(_position), TaskMap(_frame))
+    position = TaskMap(_tip)
     distance = TaskMap(
         _distance,
         {"center": jnp.asarray(rng.normal(size=3)), "radius": jnp.asarray(0.1)},
         {"center": jnp.asarray(rng.normal(size=3)), "radius": jnp.asarray(0.0)},
     )
-    leaf = leaves.GDSCollision(eps=0.1)
+    leaf = GeodesicBarrier(eps=0.1)
     split = Node(position, (Node(distance, (leaf,)),))
-    _same(run, split, Node(compose(distance, position), (leaf,)), states)
+    whole = distance.replace(fn=lambda params, q: _distance(params, _tip(q)))
+    _same(run, split, Node(whole, (leaf,)), states)
 
 
 def test_duplicating_a_leaf_with_half_the_metric_changes_nothing(states, run):
     target = leaves.PositionAttractor(jnp.asarray([0.4, 0.2, 0.9]), 100.0, weight=1.0)
     half = target.replace(weight=0.5)
-    position = compose(TaskMap(_position), TaskMap(_frame))
+    position = TaskMap(_tip)
     _same(run, Node(position, (target,)), Node(position, (half, half)), states)
 
 
 def test_siblings_are_the_sum_of_their_members(states, run):
     members = [
-        Node(TaskMap(_point, jnp.asarray(offset)), (leaves.Damping(2.0),))
+        Node(TaskMap(_point, jnp.asarray(offset)), (Drag(2.0),))
         for offset in np.random.default_rng(4).normal(size=(3, 3))
     ]
     stacked = Node(TaskMap(_frame), (Siblings.stack(members),))
@@ -359,7 +365,7 @@ def test_a_node_without_children_contributes_nothing(states):
 
 def test_siblings_without_a_stacked_array_are_refused():
     with pytest.raises(ValueError, match="leading axis"):
-        evaluate(Siblings(leaves.Damping(1.0)), jnp.zeros(2), jnp.zeros(2))
+        evaluate(Siblings(Drag(1.0)), jnp.zeros(2), jnp.zeros(2))
     with pytest.raises(ValueError, match="at least one"):
         Siblings.stack([])
 
@@ -369,7 +375,7 @@ def test_orientation_leaf_pulls_back_to_the_angular_velocity_policy(states, run)
     R_des = exp_so3(jnp.asarray([0.3, 0.5, -0.2]))
     kp = jnp.asarray([50.0, 80.0, 20.0])
     leaf = leaves.OrientationAttractor(R_des, kp, weight=0.7)
-    node = Node(compose(TaskMap(_orientation), TaskMap(_frame)), (leaf,))
+    node = Node(TaskMap(lambda q: _orientation(_frame(q))), (leaf,))
 
     def rotation(q):
         return _pose(q)[0]

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.math import critical_damping, orientation_error, skew, unskew
+from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp.algebra import RMP
-from rmp_mjx.rmp.leaf import Leaf
+from rmp_mjx.rmp.leaf import Leaf, Param
 
 
 class PositionAttractor(Leaf):
@@ -17,13 +18,13 @@ class PositionAttractor(Leaf):
     serves a coordinate of any dimension.
     """
 
-    p_des: Float[Array, " m"]
+    p_des: Float[Constant, " m"]
     """Target, (m,), [m]."""
-    kp: Float[Array, " m"] | Float[Array, ""] | float
+    kp: Param
     """Stiffness per axis or scalar, [1/s^2]."""
-    kd: Float[Array, " m"] | Float[Array, ""] | float | None = None
+    kd: Param | None = None
     """Damping, [1/s]; ``2 sqrt(kp)`` (critical) if None."""
-    weight: Float[Array, ""] | float = 1.0
+    weight: Param = 1.0
     """Scale of the identity metric."""
 
     def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
@@ -37,10 +38,10 @@ class PositionAttractor(Leaf):
 def orientation_attractor(
     R: Float[Array, "3 3"],
     omega: Float[Array, " 3"],
-    R_des: Float[Array, "3 3"],
-    kp: Float[Array, " 3"] | Float[Array, ""] | float,
-    kd: Float[Array, " 3"] | Float[Array, ""] | float | None = None,
-    weight: Float[Array, ""] | float = 1.0,
+    R_des: Float[Constant, "3 3"],
+    kp: Param,
+    kd: Param | None = None,
+    weight: Param = 1.0,
 ) -> RMP:
     r"""Orientation impedance on the angular velocity: metric I on $\omega$.
 
@@ -63,8 +64,8 @@ def orientation_attractor(
 
     Source: Shaw et al. (2021), eq. 8; Martin-Martin et al., "VICES" (2019).
     """
-    kd = critical_damping(kp) if kd is None else kd
-    alpha = kp * orientation_error(R, R_des) - kd * omega
+    damping = critical_damping(kp) if kd is None else kd
+    alpha = kp * orientation_error(R, R_des) - damping * omega
     return RMP(f=weight * alpha, M=weight * jnp.eye(3, dtype=R.dtype))
 
 
@@ -85,13 +86,13 @@ class OrientationAttractor(Leaf):
     $[\omega]^2 R$ of the curvature is orthogonal to B's range.
     """
 
-    R_des: Float[Array, "3 3"]
+    R_des: Float[Constant, "3 3"]
     """Desired orientation, (3, 3)."""
-    kp: Float[Array, " 3"] | Float[Array, ""] | float
+    kp: Param
     """Stiffness about the world axes or scalar, [1/s^2]."""
-    kd: Float[Array, " 3"] | Float[Array, ""] | float | None = None
+    kd: Param | None = None
     """Damping, [1/s]; ``2 sqrt(kp)`` if None."""
-    weight: Float[Array, ""] | float = 1.0
+    weight: Param = 1.0
     """Scale of the identity metric on the angular velocity."""
 
     def __call__(self, x: Float[Array, " 9"], xd: Float[Array, " 9"]) -> RMP:

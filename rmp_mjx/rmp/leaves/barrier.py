@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rmp_mjx.rmp.leaf import ScalarLeaf
+from rmp_mjx.rmp.leaf import Param, ScalarLeaf
 
 
 class Barrier(ScalarLeaf):
@@ -34,23 +34,23 @@ class Barrier(ScalarLeaf):
     RMPflow (Cheng et al., 2018).
     """
 
-    mu: Float[Array, ""] | float = 1e-3
+    mu: Param = 1e-3
     """Metric scale, [unit^2 s^2]."""
-    eps: Float[Array, ""] | float = 0.2
+    eps: Param = 0.2
     """Velocity floor of the metric, [unit^2/s^2]."""
-    eta: Float[Array, ""] | float = 20.0
+    eta: Param = 20.0
     """Damping, [1/s]."""
-    r: Float[Array, ""] | float = 0.3
+    r: Param = 0.3
     """Range beyond the margin at which the barrier vanishes, [unit]."""
-    margin: Float[Array, ""] | float = 0.01
+    margin: Param = 0.01
     """Distance at which the barrier is centred, [unit]."""
-    x_min: Float[Array, ""] | float = 5e-3
+    x_min: Param = 5e-3
     """Clamp of the distance to the margin, [unit], > 0."""
-    cap: Float[Array, ""] | float = 1e3
+    cap: Param = 1e3
     """Largest metric."""
-    k_out: Float[Array, ""] | float = 100.0
+    k_out: Param = 100.0
     """Outward stiffness inside the margin, [1/s^2]."""
-    v_out: Float[Array, ""] | float = 3e-3
+    v_out: Param = 3e-3
     """Speed over which a leaving body is let go, [unit/s], > 0."""
 
     def scalar(

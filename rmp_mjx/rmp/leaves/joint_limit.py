@@ -1,4 +1,4 @@
-"""Joint-limit leaves: a barrier, and the RMPflow and Lula forms for comparison."""
+"""Joint-limit leaves: a barrier, and RMPflow's for comparison."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rmp_mjx.math import approach_gate, speed_gate
-from rmp_mjx.rmp.leaf import ScalarLeaf
+from rmp_mjx.math import speed_gate
+from rmp_mjx.pytree import Constant
+from rmp_mjx.rmp.leaf import Param, ScalarLeaf
 from rmp_mjx.rmp.leaves.barrier import Barrier
 
 
@@ -23,16 +24,16 @@ class JointLimitBarrier(ScalarLeaf):
     A side at infinity contributes exactly nothing.
     """
 
-    lower: Float[Array, " n"]
+    lower: Float[Constant, "*s"]
     """Lower limits, (n,), [rad] or [m]; -inf for none."""
-    upper: Float[Array, " n"]
+    upper: Float[Constant, "*s"]
     """Upper limits, (n,), [rad] or [m]; +inf for none."""
     barrier: Barrier = flax.struct.field(default_factory=joint_limit_barrier)
     """The barrier applied to each side; its fields may be scalars or (n,)."""
 
     def scalar(
-        self, x: Float[Array, " n"], xd: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
         """Force (n,) and metric (n,) at joint positions and velocities."""
         f_lower, m_lower = self.barrier.scalar(x - self.lower, xd)
         f_upper, m_upper = self.barrier.scalar(self.upper - x, -xd)
@@ -67,26 +68,26 @@ class RMPflowJointLimit(ScalarLeaf):
     Source: Cheng et al., "RMPflow" (2018), appendix on joint limits.
     """
 
-    lower: Float[Array, " n"]
+    lower: Float[Constant, "*s"]
     """Lower limits, (n,), [rad]."""
-    upper: Float[Array, " n"]
+    upper: Float[Constant, "*s"]
     """Upper limits, (n,), [rad]."""
-    q_0: Float[Array, " n"] | None = None
+    q_0: Float[Constant, "*s"] | None = None
     """Rest position, (n,), [rad]; the middle of the range if None."""
-    lam: Float[Array, ""] | float = 0.01
+    lam: Param = 0.01
     """Metric scale."""
-    sigma: Float[Array, ""] | float = 0.1
+    sigma: Param = 0.1
     """Width of the velocity gate, [rad/s]."""
-    gamma_p: Float[Array, ""] | float = 0.05
+    gamma_p: Param = 0.05
     """Stiffness, [1/s^2]."""
-    gamma_d: Float[Array, ""] | float = 0.1
+    gamma_d: Param = 0.1
     """Damping, [1/s]."""
-    b_min: Float[Array, ""] | float = 1e-2
+    b_min: Param = 1e-2
     """Clamp of b from below: the metric is at most ``lam / b_min^2``."""
 
     def scalar(
-        self, x: Float[Array, " n"], xd: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
         """Force (n,) and metric (n,) at joint positions and velocities."""
         low, width, limited = _span(self.lower, self.upper)
         alpha_u = speed_gate(jnp.maximum(xd, 0.0), self.sigma)
@@ -106,59 +107,3 @@ class RMPflowJointLimit(ScalarLeaf):
         f = m * (self.gamma_p * (q_0 - q) - self.gamma_d * xd)
         f = f - 0.5 * self.lam * slope * xd * xd
         return jnp.where(limited, f, 0.0), jnp.where(limited, m, 0.0)
-
-
-class LulaJointLimit(ScalarLeaf):
-    r"""The joint-limit leaf of NVIDIA's Lula RMPflow, one policy per range end.
-
-    On the distance to a limit normalised by the joint's range, with speed
-    $\dot x$:
-
-    $$
-    a = \frac{k_p}{x^2 / l_p^2 + e_p} - k_d \dot x, \qquad
-    m = (1 - \mathrm{sigmoid}(\dot x / v_m)) \frac{\mu}{x / l_m + e_m},
-    $$
-
-    pulled back to the joint through the (constant) normalisation. Joints without two
-    finite limits contribute nothing. Defaults are those of the Franka configuration.
-    """
-
-    lower: Float[Array, " n"]
-    """Lower limits, (n,), [rad]."""
-    upper: Float[Array, " n"]
-    """Upper limits, (n,), [rad]."""
-    kp: Float[Array, ""] | float = 1.0
-    """Repulsion gain, [1/s^2]."""
-    lp: Float[Array, ""] | float = 0.1
-    """Length scale of the repulsion, [-]."""
-    ep: Float[Array, ""] | float = 0.01
-    """Offset that bounds the repulsion, [-]."""
-    kd: Float[Array, ""] | float = 200.0
-    """Damping, [1/s]."""
-    mu: Float[Array, ""] | float = 1000.0
-    """Metric scale."""
-    lm: Float[Array, ""] | float = 0.01
-    """Length scale of the metric, [-]."""
-    em: Float[Array, ""] | float = 1e-3
-    """Offset that bounds the metric, [-]."""
-    vm: Float[Array, ""] | float = 0.01
-    """Width of the velocity gate, [1/s]."""
-
-    def scalar(
-        self, x: Float[Array, " n"], xd: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Force (n,) and metric (n,) at joint positions and velocities."""
-        low, width, limited = _span(self.lower, self.upper)
-        s = jnp.where(limited, (x - low) / width, 0.5)
-        sd = xd / width
-        f_lower, m_lower = self._side(s, sd)
-        f_upper, m_upper = self._side(1.0 - s, -sd)
-        f = (f_lower - f_upper) / width
-        m = (m_lower + m_upper) / (width * width)
-        return jnp.where(limited, f, 0.0), jnp.where(limited, m, 0.0)
-
-    def _side(self, x: Array, xd: Array) -> tuple[Array, Array]:
-        x = jnp.maximum(x, 0.0)
-        a = self.kp / ((x / self.lp) ** 2 + self.ep) - self.kd * xd
-        m = approach_gate(xd, self.vm) * self.mu / (x / self.lm + self.em)
-        return m * a, m

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.math import critical_damping
+from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp.algebra import RMP
-from rmp_mjx.rmp.leaf import Leaf
+from rmp_mjx.rmp.leaf import Leaf, Param
 
 
 class Posture(Leaf):
@@ -19,13 +20,13 @@ class Posture(Leaf):
     Source: Martin-Martin et al., "VICES" (2019): null-space gains 10 and 2 sqrt(10).
     """
 
-    q_0: Float[Array, " n"]
+    q_0: Float[Constant, " n"]
     """Rest configuration, (n,), [rad]."""
-    kq: Float[Array, " n"] | Float[Array, ""] | float = 10.0
+    kq: Param = 10.0
     """Stiffness, [1/s^2]."""
-    kd: Float[Array, " n"] | Float[Array, ""] | float | None = None
+    kd: Param | None = None
     """Damping, [1/s]; ``2 sqrt(kq)`` if None."""
-    weight: Float[Array, ""] | float = 0.02
+    weight: Param = 0.02
     """Scale of the metric."""
 
     def acceleration(
@@ -45,3 +46,12 @@ class Posture(Leaf):
         metric = jnp.eye(x.shape[0], dtype=x.dtype) if Mq is None else Mq
         M = self.weight * metric
         return RMP(f=jnp.matmul(M, self.acceleration(x, xd), precision="highest"), M=M)
+
+
+def soft_posture(q_0: Float[Constant, " n"]) -> Posture:
+    """A soft, overdamped posture: the hand can turn past obstacles, and stays calm.
+
+    Args:
+        q_0: Rest configuration, (n,), [rad].
+    """
+    return Posture(q_0=q_0, kq=2.5, kd=10.0)
