@@ -125,7 +125,7 @@ class Door(ArmEnv):
             jnp.stack([R, R]),
             velocities=jnp.cross(spin, arms),
             angular_velocities=jnp.stack([spin, spin]),
-            worked=np.array([False, True]),
+            hand_may_touch=np.array([False, True]),
         )
 
     def _sweep(self) -> np.ndarray:

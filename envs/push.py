@@ -130,7 +130,7 @@ class Push(ArmEnv):
             R[None],
             velocities=data.qvel[None, n : n + 3],
             angular_velocities=(R @ data.qvel[n + 3 : n + 6])[None],
-            worked=True,
+            hand_may_touch=True,
         )
 
     def begin(

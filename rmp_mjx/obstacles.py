@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-import jax
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import ArrayLike
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 
-from rmp_mjx.pytree import Pytree
-from rmp_mjx.shapes import KINDS, TINY, Boxes, Capsules, Gap, Planes, Spheres
+from rmp_mjx.pytree import Constant, Pytree
+from rmp_mjx.shapes import KINDS, TINY, Boxes, Capsules, Gap, Planes, Shape, Spheres
 from rmp_mjx.vec import Vec
+
+Kind = TypeVar("Kind", bound=Shape)
+
+Numbers = ArrayLike | Sequence[Any]
+"""What `jnp.asarray` takes: arrays, numbers, lists of them."""
 
 
 class Obstacles(Pytree):
@@ -38,7 +47,7 @@ class Obstacles(Pytree):
 
         def common(n: int) -> dict[str, Array]:
             off = jnp.zeros(n, bool)
-            return {"velocity": jnp.zeros((n, 3)), "worked": off, "active": off}
+            return {"velocity": jnp.zeros((n, 3)), "hand_may_touch": off, "active": off}
 
         def turning(n: int) -> dict[str, Array]:
             spin = {"angular_velocity": jnp.zeros((n, 3))}
@@ -70,12 +79,14 @@ class Obstacles(Pytree):
         )
 
     @property
-    def kinds(self) -> tuple[Spheres | Planes | Capsules | Boxes, ...]:
+    def kinds(self) -> tuple[Shape, ...]:
         """The kinds that have at least one slot."""
         every = (self.spheres, self.planes, self.capsules, self.boxes)
         return tuple(kind for kind in every if kind.active.shape[-1])
 
-    def gaps(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> dict[str, Gap]:
+    def gaps(
+        self, x: Vec, v: Vec, rho: Float[Constant, " p"], hand: Bool[np.ndarray, " p"]
+    ) -> dict[str, Gap]:
         """Distances of control points to the obstacles, by kind with any slots.
 
         Args:
@@ -87,7 +98,12 @@ class Obstacles(Pytree):
         return {KINDS[type(kind)]: kind.gap(x, v, rho, hand) for kind in self.kinds}
 
     def with_spheres(
-        self, centers, radii, velocities=None, worked: ArrayLike = False
+        self,
+        centers: Numbers,
+        radii: Numbers,
+        velocities: Numbers | None = None,
+        *,
+        hand_may_touch: Numbers = False,
     ) -> Obstacles:
         """Use the first k sphere slots.
 
@@ -95,75 +111,100 @@ class Obstacles(Pytree):
             centers: (k, 3), world frame [m].
             radii: (k,) or one number [m].
             velocities: (k, 3) [m/s]; default at rest.
-            worked: (k,) or one bool: whether the hand works on them.
+            hand_may_touch: (k,) or one bool; all other links still avoid them.
 
         Raises:
             ValueError: More than the slots there are, or a radius that is not positive.
         """
         _check_positive("sphere radii", radii)
-        return self.replace(
-            spheres=_fill(
-                self.spheres,
-                center=centers,
-                radius=radii,
-                velocity=velocities,
-                worked=worked,
-            )
+        spheres = _fill(
+            self.spheres,
+            center=centers,
+            radius=radii,
+            velocity=velocities,
+            hand_may_touch=hand_may_touch,
         )
+        return self.replace(spheres=spheres)
 
     def with_planes(
-        self, points, normals, velocities=None, worked: ArrayLike = False
+        self,
+        points: Numbers,
+        normals: Numbers,
+        velocities: Numbers | None = None,
+        *,
+        hand_may_touch: Numbers = False,
     ) -> Obstacles:
-        """Use the first k plane slots: a point (k, 3) on each and its normal (k, 3)."""
+        """Use the first k plane slots.
+
+        Args:
+            points: A point on each, (k, 3), world frame [m].
+            normals: Normals that point out of the obstacles, (k, 3), of any length.
+            velocities: Of the surfaces, (k, 3) [m/s]; default at rest.
+            hand_may_touch: (k,) or one bool; all other links still avoid them.
+
+        Raises:
+            ValueError: More than the slots there are.
+        """
         normals = jnp.asarray(normals, float)
-        unit = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
-        return self.replace(
-            planes=_fill(
-                self.planes,
-                point=points,
-                normal=unit,
-                velocity=velocities,
-                worked=worked,
-            )
+        planes = _fill(
+            self.planes,
+            point=points,
+            normal=normals / jnp.linalg.norm(normals, axis=-1, keepdims=True),
+            velocity=velocities,
+            hand_may_touch=hand_may_touch,
         )
+        return self.replace(planes=planes)
 
     def with_capsules(
         self,
-        starts,
-        ends,
-        radii,
-        velocities=None,
-        angular_velocities=None,
-        worked: ArrayLike = False,
+        starts: Numbers,
+        ends: Numbers,
+        radii: Numbers,
+        velocities: Numbers | None = None,
+        angular_velocities: Numbers | None = None,
+        *,
+        hand_may_touch: Numbers = False,
     ) -> Obstacles:
-        """Use the first k capsule slots: segments (k, 3) to (k, 3) [m] and radii."""
+        """Use the first k capsule slots.
+
+        Args:
+            starts: One end of each segment, (k, 3), world frame [m].
+            ends: The other end, (k, 3) [m].
+            radii: (k,) or one number [m].
+            velocities: Of the centres, (k, 3) [m/s]; default at rest.
+            angular_velocities: World frame, (k, 3) [rad/s]; default none.
+            hand_may_touch: (k,) or one bool; all other links still avoid them.
+
+        Raises:
+            ValueError: More than the slots there are, or a radius that is not positive.
+        """
         _check_positive("capsule radii", radii)
         starts, ends = jnp.asarray(starts, float), jnp.asarray(ends, float)
         length = jnp.linalg.norm(ends - starts, axis=-1)
         axis = (ends - starts) / jnp.maximum(length, TINY)[..., None]
         up = jnp.array([0.0, 0.0, 1.0])
-        return self.replace(
-            capsules=_fill(
-                self.capsules,
-                center=0.5 * (starts + ends),
-                axis=jnp.where(length[..., None] > TINY, axis, up),
-                half_length=0.5 * length,
-                radius=radii,
-                velocity=velocities,
-                angular_velocity=angular_velocities,
-                worked=worked,
-            )
+        capsules = _fill(
+            self.capsules,
+            center=0.5 * (starts + ends),
+            axis=jnp.where(length[..., None] > TINY, axis, up),
+            half_length=0.5 * length,
+            radius=radii,
+            velocity=velocities,
+            angular_velocity=angular_velocities,
+            hand_may_touch=hand_may_touch,
         )
+        return self.replace(capsules=capsules)
 
     def with_boxes(
         self,
-        centers,
-        half_sizes,
-        rotations=None,
-        radii=0.0,
-        velocities=None,
-        angular_velocities=None,
-        worked: ArrayLike = False,
+        centers: Numbers,
+        half_sizes: Numbers,
+        rotations: Numbers | None = None,
+        radii: Numbers = 0.0,
+        velocities: Numbers | None = None,
+        angular_velocities: Numbers | None = None,
+        *,
+        hand_may_touch: Numbers = False,
     ) -> Obstacles:
         """Use the first k box slots.
 
@@ -174,7 +215,7 @@ class Obstacles(Pytree):
             radii: Rounding added to the core, (k,) or one number [m].
             velocities: Of the centres, (k, 3) [m/s]; default at rest.
             angular_velocities: World frame, (k, 3) [rad/s]; default none.
-            worked: (k,) or one bool: whether the hand works on them.
+            hand_may_touch: (k,) or one bool; all other links still avoid them.
 
         Raises:
             ValueError: More than the slots there are, or a half size not positive.
@@ -182,36 +223,35 @@ class Obstacles(Pytree):
         _check_positive("box half sizes", half_sizes)
         if rotations is None:
             rotations = jnp.tile(jnp.eye(3), (np.shape(centers)[0], 1, 1))
-        return self.replace(
-            boxes=_fill(
-                self.boxes,
-                center=centers,
-                rotation=rotations,
-                half_size=half_sizes,
-                radius=radii,
-                velocity=velocities,
-                angular_velocity=angular_velocities,
-                worked=worked,
-            )
+        boxes = _fill(
+            self.boxes,
+            center=centers,
+            rotation=rotations,
+            half_size=half_sizes,
+            radius=radii,
+            velocity=velocities,
+            angular_velocity=angular_velocities,
+            hand_may_touch=hand_may_touch,
         )
+        return self.replace(boxes=boxes)
 
 
-def _check_positive(what: str, values) -> None:
+def _check_positive(what: str, values: Numbers) -> None:
     """Refuse concrete values that are not positive and finite; tracers pass."""
-    if isinstance(values, jax.core.Tracer):
+    if isinstance(values, Tracer):
         return
     array = np.asarray(values, float)
     if not (np.all(np.isfinite(array)) and np.all(array > 0)):
         raise ValueError(f"{what} must be positive and finite, got {array.tolist()}")
 
 
-def _fill(slots, **contents):
+def _fill(slots: Kind, **contents: Numbers | None) -> Kind:
     """Write k obstacles into the first k slots and switch the rest off."""
     total = slots.active.shape[0]
     first = next(value for value in contents.values() if value is not None)
     k = np.shape(first)[0]
     if k > total:
-        kind = type(slots).__name__.lower()
+        kind = KINDS[type(slots)]
         raise ValueError(
             f"{k} {kind} do not fit in {total} slots: "
             f"start from Obstacles.empty({kind}={k})"

@@ -15,6 +15,7 @@ centripetal terms of a rotating obstacle. The gradient is a unit normal everywhe
 
 from __future__ import annotations
 
+import abc
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from rmp_mjx.pytree import Pytree
+from rmp_mjx.pytree import Constant, Pytree
 from rmp_mjx.vec import Vec, xyz
 
 TINY = 1e-9
@@ -41,112 +42,116 @@ class Gap(NamedTuple):
     curvature: Array
     """The part of the distance's acceleration that is not normal . xdd [m/s^2]."""
     active: Array
-    """Whether the control point has to keep off, (o, p)."""
+    """Whether the control point has to keep off."""
 
 
-class Spheres(Pytree):
+class Shape(Pytree, abc.ABC):
+    """Obstacles of one kind: o slots, of which some are in use."""
+
+    velocity: Float[Constant, "o 3"]
+    """Velocity of the centre, of a plane that of its surface [m/s]."""
+    hand_may_touch: Bool[Constant, " o"]
+    """Whether the hand may touch it. All other links still avoid it."""
+    active: Bool[Constant, " o"]
+    """Whether the slot is in use."""
+
+    @abc.abstractmethod
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+        """Distance of every control point to every obstacle; see `Obstacles.gaps`."""
+
+    def _avoided(self, hand: Bool[np.ndarray, " p"]) -> Bool[Array, "o p"]:
+        """Which control points keep off which obstacles."""
+        exempt = self.hand_may_touch[:, None] & hand
+        return jnp.asarray(self.active)[:, None] & ~exempt
+
+
+class Turning(Shape):
+    """Rounded bodies that may turn."""
+
+    center: Float[Constant, "o 3"]
+    """Centre, world frame [m]."""
+    radius: Float[Constant, " o"]
+    """Radius of the rounding [m]; it comes on top of the core."""
+    angular_velocity: Float[Constant, "o 3"]
+    """Angular velocity, world frame [rad/s]."""
+
+    def _ride_along(self, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
+        """Position, velocity and Coriolis acceleration in the moving frame."""
+        omega = Vec.column(self.angular_velocity)
+        r = x - Vec.column(self.center)
+        rdot = v - Vec.column(self.velocity)
+        swept = omega.cross(r)
+        coriolis = omega.cross(swept) - omega.cross(rdot) * 2.0
+        return r, rdot - swept, coriolis
+
+
+class Spheres(Shape):
     """Balls."""
 
-    center: Float[Array, "o 3"]
+    center: Float[Constant, "o 3"]
     """Centre, world frame [m]."""
-    radius: Float[Array, " o"]
+    radius: Float[Constant, " o"]
     """Radius [m]."""
-    velocity: Float[Array, "o 3"]
-    """Velocity of the centre [m/s]."""
-    worked: Bool[Array, " o"]
-    """What the hand works on: the other links alone keep off."""
-    active: Bool[Array, " o"]
-    """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
-        """See `Obstacles.gaps`."""
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+        """Distances, rates, normals and curvatures, (o, p) each."""
         g = x - Vec.column(self.center)
         gdot = v - Vec.column(self.velocity)
-        return _inflate(g, gdot, self.radius[:, None] + rho, _avoided(self, hand))
+        return _inflate(g, gdot, self.radius[:, None] + rho, self._avoided(hand))
 
 
-class Planes(Pytree):
+class Planes(Shape):
     """Half-spaces."""
 
-    point: Float[Array, "o 3"]
+    point: Float[Constant, "o 3"]
     """A point on the surface, world frame [m]."""
-    normal: Float[Array, "o 3"]
+    normal: Float[Constant, "o 3"]
     """Unit normal that points out of the obstacle."""
-    velocity: Float[Array, "o 3"]
-    """Velocity of the surface [m/s]."""
-    worked: Bool[Array, " o"]
-    """What the hand works on: the other links alone keep off."""
-    active: Bool[Array, " o"]
-    """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
-        """See `Obstacles.gaps`."""
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+        """Distances, rates, normals and curvatures, (o, p) each."""
         n = Vec.column(self.normal)
         distance = n @ (x - Vec.column(self.point)) - rho
         rate = n @ (v - Vec.column(self.velocity))
-        return Gap(distance, rate, n, jnp.zeros_like(rate), _avoided(self, hand))
+        return Gap(distance, rate, n, jnp.zeros_like(rate), self._avoided(hand))
 
 
-class Capsules(Pytree):
+class Capsules(Turning):
     """Segments inflated by a radius."""
 
-    center: Float[Array, "o 3"]
-    """Middle of the segment, world frame [m]."""
-    axis: Float[Array, "o 3"]
+    axis: Float[Constant, "o 3"]
     """Unit vector along the segment."""
-    half_length: Float[Array, " o"]
+    half_length: Float[Constant, " o"]
     """Half the segment's length [m]."""
-    radius: Float[Array, " o"]
-    """Radius [m]."""
-    velocity: Float[Array, "o 3"]
-    """Velocity of the centre [m/s]."""
-    angular_velocity: Float[Array, "o 3"]
-    """Angular velocity, world frame [rad/s]."""
-    worked: Bool[Array, " o"]
-    """What the hand works on: the other links alone keep off."""
-    active: Bool[Array, " o"]
-    """Slots in use."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
-        """See `Obstacles.gaps`."""
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+        """Distances, rates, normals and curvatures, (o, p) each."""
         axis, half = Vec.column(self.axis), self.half_length[:, None]
-        r, rel, coriolis = _ride_along(self, x, v)
+        r, rel, coriolis = self._ride_along(x, v)
         along = axis @ r
         free = jnp.abs(along) >= half
         g = r - axis * jnp.clip(along, -half, half)
         gdot = rel - axis * jnp.where(free, 0.0, axis @ rel)
         radius = self.radius[:, None] + rho
-        return _inflate(g, gdot, radius, _avoided(self, hand), coriolis)
+        return _inflate(g, gdot, radius, self._avoided(hand), coriolis)
 
 
-class Boxes(Pytree):
+class Boxes(Turning):
     """Boxes with rounded edges: a box core inflated by a radius."""
 
-    center: Float[Array, "o 3"]
-    """Centre, world frame [m]."""
-    rotation: Float[Array, "o 3 3"]
+    rotation: Float[Constant, "o 3 3"]
     """Orientation (columns are the box's axes)."""
-    half_size: Float[Array, "o 3"]
-    """Half sizes of the core [m]; the radius comes on top."""
-    radius: Float[Array, " o"]
-    """Rounding radius [m]."""
-    velocity: Float[Array, "o 3"]
-    """Velocity of the centre [m/s]."""
-    angular_velocity: Float[Array, "o 3"]
-    """Angular velocity, world frame [rad/s]."""
-    worked: Bool[Array, " o"]
-    """What the hand works on: the other links alone keep off."""
-    active: Bool[Array, " o"]
-    """Slots in use."""
+    half_size: Float[Constant, "o 3"]
+    """Half sizes of the core [m]."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: np.ndarray) -> Gap:
-        """See `Obstacles.gaps`.
+    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+        """Distances, rates, normals and curvatures, (o, p) each.
 
         Inside the core the distance is minus the depth below the nearest face.
         """
         axes = [Vec.column(self.rotation[:, :, i]) for i in range(3)]
         half = Vec.column(self.half_size)
-        r, rel, coriolis = _ride_along(self, x, v)
+        r, rel, coriolis = self._ride_along(x, v)
         local, local_v, local_c = (
             Vec(*(a @ w for a in axes)) for w in (r, rel, coriolis)
         )
@@ -163,7 +168,7 @@ class Boxes(Pytree):
         local_g = free.map(lambda f, s, o: jnp.where(f, s * o, 0.0), sign, reach)
         local_gdot = free.map(lambda f, c: jnp.where(f, c, 0.0), local_v)
         radius = self.radius[:, None] + rho
-        gap = _inflate(local_g, local_gdot, radius, _avoided(self, hand), local_c)
+        gap = _inflate(local_g, local_gdot, radius, self._avoided(hand), local_c)
         n = gap.normal
         return gap._replace(
             normal=axes[0] * n.x + axes[1] * n.y + axes[2] * n.z,
@@ -192,20 +197,10 @@ def _inflate(
     return Gap(distance, rate, normal, turning / norm, active)
 
 
-def _avoided(kind: Spheres | Planes | Capsules | Boxes, hand: np.ndarray) -> Array:
-    """Which control points keep off which obstacles, (o, p)."""
-    return kind.active[:, None] & ~(kind.worked[:, None] & hand)
-
-
-def _ride_along(body: Capsules | Boxes, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
-    """Position, velocity and Coriolis acceleration seen from a moving obstacle."""
-    omega = Vec.column(body.angular_velocity)
-    r = x - Vec.column(body.center)
-    rdot = v - Vec.column(body.velocity)
-    swept = omega.cross(r)
-    coriolis = omega.cross(swept) - omega.cross(rdot) * 2.0
-    return r, rdot - swept, coriolis
-
-
-KINDS = {Spheres: "spheres", Planes: "planes", Capsules: "capsules", Boxes: "boxes"}
+KINDS: dict[type[Shape], str] = {
+    Spheres: "spheres",
+    Planes: "planes",
+    Capsules: "capsules",
+    Boxes: "boxes",
+}
 """Kinds of obstacles by name."""

@@ -222,13 +222,13 @@ def test_unused_slots_are_inactive_and_finite(points):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_hand_may_touch_what_it_works_on_and_the_other_links_may_not(
+def test_the_hand_may_touch_what_it_is_told_and_the_other_links_may_not(
     kind, scene, points
 ):
-    """Points with even numbers are the hand's; the first obstacle alone is worked."""
-    worked = np.arange(6) == 0
+    """Even points are the hand's, which may touch the first obstacle alone."""
+    touch = np.arange(6) == 0
     with jax.enable_x64(True):
-        slots = getattr(scene[0], f"with_{kind}")(*scene[1][kind], worked=worked)
+        slots = getattr(scene[0], f"with_{kind}")(*scene[1][kind], hand_may_touch=touch)
         gap = dict(zip(KINDS, _gaps(slots, *points), strict=True))[kind]
     active = np.asarray(gap.active)
     assert active[1:].all()

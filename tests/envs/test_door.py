@@ -89,7 +89,7 @@ def test_the_tree_keeps_the_links_but_not_the_hand_off_the_handle(env, scene, st
     mujoco.mj_kinematics(model, d)
     lane = jax.tree.map(lambda x: x[0], starts.info["spheres"])
     seen = env.obstacles(data, lane).boxes
-    assert seen.worked.tolist() == [False, True]
+    assert seen.hand_may_touch.tolist() == [False, True]
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for name in HANDLE:
         bar = model.geom(name).id

@@ -95,7 +95,7 @@ def test_the_tree_keeps_the_links_but_not_the_hand_off_the_block(env, lane):
     }
     for name, value in expected.items():
         np.testing.assert_allclose(getattr(seen, name)[0], value, atol=1e-6)
-    assert seen.worked.tolist() == [True]
+    assert seen.hand_may_touch.tolist() == [True]
 
 
 def test_a_block_that_is_not_touched_rests(env, lane):
