@@ -19,7 +19,7 @@ from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, Contacts, build_scene, no_objects
 from envs.spheres import AWAY, Spheres
 from envs.types import ARM_ENTRIES, METRICS, SHARED, Entry, Score, State
-from rmp_mjx.control import ACTION_SIZE, RMPVICES, VICES
+from rmp_mjx.control import ACTION_SIZE, Controller
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import ScalarLeaf
 from rmp_mjx.robot import Robot
@@ -80,9 +80,9 @@ class ArmEnv(abc.ABC):
             controller = options.CONTROLLERS[asked.controller](robot)
             leaves = self.collision_leaves(robot)
             if asked.controller == "rmp_vices" and leaves:
-                controller = controller.replace(collision=leaves)
+                controller = controller.with_collision(leaves)
         self.robot: Robot = robot
-        self.controller: RMPVICES | VICES = controller
+        self.controller: Controller = controller
         self.scene = build_scene(
             robot,
             asked.sim_dt,
@@ -278,8 +278,7 @@ class ArmEnv(abc.ABC):
     ) -> tuple[PhysicsState, Spheres, Setpoint, SafetyRecord]:
         """Hold one action for a policy step; the tree runs at every physics step."""
         ctrl, n = self.controller, self.robot.n
-        setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
-        setpoint = setpoint.replace(time=jnp.asarray(time, jnp.float32))
+        setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action), time)
 
         def substep(carry, _):
             data, spheres, torques, motion, record = carry

@@ -73,8 +73,8 @@ def policy_step(
     yield Moment("before", {"action": np.asarray(action), **_motion(data)})
 
     ctrl = env.controller
-    setpoint = jax.jit(lambda q, a: ctrl.setpoint(q, ctrl.decode(a)))(
-        data.qpos[:n], jnp.asarray(action)
+    setpoint = jax.jit(lambda q, a, time: ctrl.setpoint(q, ctrl.decode(a), time))(
+        data.qpos[:n], jnp.asarray(action), env.dt * info["step"]
     )
     yield Moment("set-point", {k: np.asarray(v) for k, v in vars(setpoint).items()})
 

@@ -4,8 +4,10 @@ from rmp_mjx.control import ACTION_SIZE as ACTION_SIZE
 from rmp_mjx.control import RMPVICES as RMPVICES
 from rmp_mjx.control import VICES as VICES
 from rmp_mjx.control import ActionRange as ActionRange
-from rmp_mjx.control import Stirring as Stirring
-from rmp_mjx.control import Yielding as Yielding
+from rmp_mjx.control import Controller as Controller
+from rmp_mjx.control import Leaves as Leaves
+from rmp_mjx.control import OrientationRelaxation as OrientationRelaxation
+from rmp_mjx.control import SetpointDither as SetpointDither
 from rmp_mjx.control import per_link as per_link
 from rmp_mjx.control import rmp_vices_literal as rmp_vices_literal
 from rmp_mjx.obstacles import Obstacles as Obstacles

@@ -140,7 +140,6 @@ def test_the_rooms_of_training_stand_on_each_other(path):
             assert other in TRAINING[here], f"{dotted(path)} imports {name}"
 
 
-@pytest.mark.xfail(reason="the tree takes the whole controller")
 def test_no_modules_import_each_other_in_a_circle():
     graph = {dotted(p): edges(p) for p in modules("rmp_mjx") + modules("envs")}
     assert "rmp_mjx.training.runs.run_folder" in graph["rmp_mjx.training.runs.watch"]

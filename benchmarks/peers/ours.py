@@ -17,6 +17,7 @@ from mujoco import mjx
 
 import envs
 import rmp_mjx as rmp
+from benchmarks.autodiff import AutodiffRMPVICES
 from benchmarks.common import on_all_devices
 from benchmarks.peers.point_mass import ACTION_SIZE, OBSERVATION_SIZE, SETTINGS, Point
 from benchmarks.peers.problem import controller
@@ -65,7 +66,7 @@ def torques(
     robot = rmp.Robot.load("jaco2")
     ctrl = make(robot)
     q, qd, action, obstacles = random_states(robot, batch, seed=0)
-    setpoint = jax.jit(jax.vmap(ctrl.setpoint))(q, action)
+    setpoint = jax.jit(jax.vmap(ctrl.setpoint, in_axes=(0, 0, None)))(q, action, 0.0)
 
     def torque(q, qd, setpoint):
         return ctrl(q, qd, setpoint, obstacles).tau
@@ -186,7 +187,7 @@ def measures() -> dict[str, Callable[[], Measure]]:
         "rmp_vices": rmp.RMPVICES,
         "vices": rmp.VICES,
         "rmp2_tree": controller,
-        "autodiff": partial(rmp.RMPVICES, jacobian="autodiff"),
+        "autodiff": AutodiffRMPVICES,
     }
     found = {f"evals_{name}": throughput(make) for name, make in kinds.items()}
     found |= {f"latency_{name}": single(make) for name, make in kinds.items()}

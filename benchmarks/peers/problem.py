@@ -19,7 +19,8 @@ BARRIER = ("mu", "eps", "eta", "r", "margin", "x_min", "cap", "k_out", "v_out")
 
 def controller(robot: rmp.Robot) -> rmp.RMPVICES:
     """Our controller without the parts that RMP2 lacks."""
-    return rmp.RMPVICES(robot, self_collision=None, yielding=None, limit_yielding=None)
+    leaves = rmp.Leaves.default(robot).replace(self_collision=None)
+    return rmp.RMPVICES(robot, leaves, obstacle_relaxation=None, limit_relaxation=None)
 
 
 def arrays(seed: int) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def arrays(seed: int) -> dict[str, Any]:
     robot = rmp.Robot.load("jaco2")
     ctrl: Any = controller(robot)
     q, qd, action, obstacles = jax.tree.map(double, random_states(robot, BATCH, seed))
-    setpoint = jax.jit(jax.vmap(ctrl.setpoint))(q, action)
+    setpoint = jax.jit(jax.vmap(ctrl.setpoint, in_axes=(0, 0, None)))(q, action, 0.0)
 
     @jax.jit
     @jax.vmap
@@ -41,12 +42,15 @@ def arrays(seed: int) -> dict[str, Any]:
         return Mq, ctrl(q, qd, setpoint, obstacles).qdd
 
     Mq, qdd = evaluate(q, qd, setpoint)
-    leaves = {"collision": ctrl.collision, "joint_limit": ctrl.joint_limit.barrier}
+    leaves = {
+        "collision": ctrl.leaves.collision,
+        "joint_limit": ctrl.leaves.joint_limit.barrier,
+    }
     barriers = {
         name: [getattr(leaf, field) for field in BARRIER]
         for name, leaf in leaves.items()
     }
-    posture, points = ctrl.posture, robot.points
+    posture, points = ctrl.leaves.posture, robot.points
     found = barriers | {
         "offset": robot.offset,
         "rotation": robot.rotation,

@@ -66,9 +66,9 @@ class Arm(NamedTuple):
     """Barrier of the self-collision leaves."""
     joint_limit: np.ndarray
     """Barrier of the joint-limit leaf."""
-    yielding: np.ndarray
+    obstacle_relaxation: np.ndarray
     """Relaxation near obstacles: (min_weight, near, far)."""
-    limit_yielding: np.ndarray
+    limit_relaxation: np.ndarray
     """Relaxation near joint limits."""
     posture: np.ndarray
     """(stiffness, damping, weight, the root's regulariser)."""
@@ -216,8 +216,8 @@ def avoid_self(arm, geom_xpos, geom_xmat, S, V, A, f, M):
 @njit(fastmath=FAST, cache=True)
 def weight(leaf, room):
     """Weight of the orientation at this distance."""
-    least, near, far = leaf[0], leaf[1], leaf[2]
-    return least ** min(max(far - room, 0.0) / (far - near), 1.0)
+    min_weight, near, far = leaf[0], leaf[1], leaf[2]
+    return min_weight ** min(max(far - room, 0.0) / (far - near), 1.0)
 
 
 @njit(fastmath=FAST, cache=True)
@@ -260,7 +260,7 @@ def rmp_vices(arm, fields, p_des, R_des, kp, spheres, tau):
         v, a = np.empty(3), np.empty(3)
         twists(fields.xanchor[e], fields.xaxis[e], qd, S, V, A)
         unpack(fields.M[e], Mq)
-        beside = avoid_obstacles(
+        body_clearance = avoid_obstacles(
             arm, fields.xpos[e], fields.xmat[e], S, V, A, spheres[e], f, M
         )
         avoid_self(arm, fields.geom_xpos[e], fields.geom_xmat[e], S, V, A, f, M)
@@ -275,7 +275,10 @@ def rmp_vices(arm, fields, p_des, R_des, kp, spheres, tau):
             m, wanted = barrier(arm.joint_limit, above, -qd[j])
             f[j] -= m * wanted
             M[j, j] += m
-        turning = min(weight(arm.yielding, beside), weight(arm.limit_yielding, room))
+        turning = min(
+            weight(arm.obstacle_relaxation, body_clearance),
+            weight(arm.limit_relaxation, room),
+        )
 
         impedance(arm, fields, e, p_des[e], R_des[e], kp[e], S, V, pull, J)
         move(V, A, N - 1, fields.site_xpos[e, arm.site], v, a)

@@ -25,7 +25,8 @@ def arm_arrays(env: envs.ArmEnv) -> dict[str, Any]:
     ctrl: Any = env.controller
     points, capsules = robot.points, robot.capsules
     geoms = [model.geom(ARM + name).id for name in capsules.geom]
-    posture = ctrl.posture
+    leaves = ctrl.leaves
+    posture = leaves.posture
     return {
         "point_body": np.array([model.body(ARM + name).id for name in points.body]),
         "point_joint": np.array(points.segment),
@@ -40,11 +41,11 @@ def arm_arrays(env: envs.ArmEnv) -> dict[str, Any]:
         "q_lower": np.asarray(robot.q_lower),
         "q_upper": np.asarray(robot.q_upper),
         "tau_max": np.asarray(robot.tau_max),
-        "collision": _barrier(ctrl.collision),
-        "self_collision": _barrier(ctrl.self_collision),
-        "joint_limit": _barrier(ctrl.joint_limit.barrier),
-        "yielding": _yielding(ctrl.yielding),
-        "limit_yielding": _yielding(ctrl.limit_yielding),
+        "collision": _barrier(leaves.collision),
+        "self_collision": _barrier(leaves.self_collision),
+        "joint_limit": _barrier(leaves.joint_limit.barrier),
+        "obstacle_relaxation": _relaxation(ctrl.obstacle_relaxation),
+        "limit_relaxation": _relaxation(ctrl.limit_relaxation),
         "posture": np.array(
             [posture.kq, posture.kd, posture.weight, ctrl.regularizer], float
         ),
@@ -64,7 +65,8 @@ def states(env: envs.ArmEnv, seed: int) -> dict[str, Any]:
             [[0.0, 0.0, TABLE_HEIGHT]], [[0.0, 0.0, 1.0]]
         )
         obstacles = jax.tree.map(double, obstacles)
-        setpoint = jax.jit(jax.vmap(env.controller.setpoint))(q, action)
+        setpoints = jax.vmap(env.controller.setpoint, in_axes=(0, 0, None))
+        setpoint = jax.jit(setpoints)(q, action, 0.0)
         torques = {}
         for name, ctrl in (("rmp_vices", env.controller), ("vices", rmp.VICES(robot))):
             act = jax.jit(jax.vmap(ctrl, in_axes=(0, 0, 0, None)))
@@ -94,5 +96,5 @@ def _barrier(leaf) -> np.ndarray:
     return np.array([getattr(leaf, field) for field in BARRIER], float)
 
 
-def _yielding(leaf) -> np.ndarray:
-    return np.array([leaf.least, leaf.near, leaf.far], float)
+def _relaxation(leaf) -> np.ndarray:
+    return np.array([leaf.min_weight, leaf.near, leaf.far], float)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rmp_mjx as rmp
+from benchmarks.autodiff import AutodiffRMPVICES
 from benchmarks.common import (
     Row,
     measure,
@@ -78,7 +79,7 @@ def throughput(
 ) -> tuple[Row, ...]:
     """Evaluations a second of a batch sharing its obstacles, and the compile time."""
     q, qd, action, obstacles = random_states(ctrl.robot, batch, seed)
-    setpoint = jax.jit(jax.vmap(ctrl.setpoint))(q, action)
+    setpoint = jax.jit(jax.vmap(ctrl.setpoint, in_axes=(0, 0, None)))(q, action, 0.0)
 
     def torque(q, qd, setpoint, obstacles):
         return ctrl(q, qd, setpoint, obstacles).tau
@@ -99,7 +100,7 @@ def latency(ctrl: rmp.RMPVICES | rmp.VICES, seed: int, calls: int) -> list[Row]:
     """Median and 99th percentile of single jitted calls."""
     q, qd, action, obstacles = random_states(ctrl.robot, 1, seed)
     q, qd, action = jax.tree.map(lambda x: x[0], (q, qd, action))
-    setpoint = ctrl.setpoint(q, action)
+    setpoint = ctrl.setpoint(q, action, 0.0)
 
     def torque(q, qd, setpoint, obstacles):
         return ctrl(q, qd, setpoint, obstacles).tau
@@ -120,8 +121,7 @@ def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
         ("vices", "", rmp.VICES(robot)),
     ]
     if autodiff:
-        tree = rmp.RMPVICES(robot, jacobian="autodiff")
-        named.append(("controller", "_autodiff", tree))
+        named.append(("controller", "_autodiff", AutodiffRMPVICES(robot)))
     rows = []
     for name, suffix, ctrl in named:
         single = latency(ctrl, seed, calls)

@@ -91,7 +91,7 @@ def controller_time(env, state, action, seconds: float) -> float:
     def torques(data, spheres, action):
         obstacles = env.obstacles(data, spheres)
         q, qd = data.qpos[:n], data.qvel[:n]
-        setpoint = ctrl.setpoint(q, ctrl.decode(action))
+        setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
 
         def substep(qd, _):
             tau = ctrl(q, qd, setpoint, obstacles).tau

@@ -157,7 +157,7 @@ def count() -> dict[str, float]:
     robot = rmp.Robot.load("jaco2")
     ctrl = rmp.RMPVICES(robot)
     q, qd, action, obstacles = random_states(robot, 256, seed=0)
-    setpoint = jax.vmap(ctrl.setpoint)(q, action)
+    setpoint = jax.vmap(ctrl.setpoint, in_axes=(0, 0, None))(q, action, 0.0)
 
     def torque(q, qd, setpoint):
         return jax.vmap(ctrl, in_axes=(0, 0, 0, None))(q, qd, setpoint, obstacles).tau

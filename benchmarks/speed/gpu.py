@@ -90,7 +90,8 @@ def torques(ctrl: rmp.RMPVICES, centers):
     obstacles = obstacles.with_planes([[0.0, 0.0, TABLE_HEIGHT]], [[0.0, 0.0, 1.0]])
 
     def act(q, qd, action):
-        return ctrl(q, qd, ctrl.setpoint(q, ctrl.decode(action)), obstacles).tau
+        setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
+        return ctrl(q, qd, setpoint, obstacles).tau
 
     return jax.vmap(act)
 

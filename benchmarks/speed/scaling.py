@@ -94,7 +94,7 @@ def controller_time(
 ) -> float:
     """Seconds of one evaluation in a batch."""
     q, qd, action, _ = random_states(ctrl.robot, BATCH, seed=0)
-    setpoint = jax.jit(jax.vmap(ctrl.setpoint))(q, action)
+    setpoint = jax.jit(jax.vmap(ctrl.setpoint, in_axes=(0, 0, None)))(q, action, 0.0)
 
     def torque(q, qd, setpoint, obstacles):
         return jax.vmap(ctrl, in_axes=(0, 0, 0, None))(q, qd, setpoint, obstacles).tau
@@ -150,7 +150,8 @@ def joints(sizes: Sequence[int], seconds: float) -> Curve:
     times = []
     for size in sizes:
         robot = rmp.Robot.from_mjcf(chain(size), site="tip", spacing=0.03)
-        ctrl = rmp.RMPVICES(robot, self_collision=None)
+        leaves = rmp.Leaves.default(robot).replace(self_collision=None)
+        ctrl = rmp.RMPVICES(robot, leaves)
         times.append(controller_time(ctrl, spheres(5), seconds))
     return Curve("joints", "evaluation", tuple(sizes), tuple(times))
 

@@ -4,58 +4,68 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import optuna
 
 import rmp_mjx as rmp
-from rmp_mjx.control.stirring import Stirring
-from rmp_mjx.control.yielding import Yielding, limit_yielding
-from rmp_mjx.rmp.leaves import JointLimitBarrier, Posture
-from rmp_mjx.rmp.leaves.collision import collision_near
-from rmp_mjx.rmp.leaves.joint_limit import joint_limit_barrier
+from rmp_mjx.control.relaxation import joint_limit_relaxation
+from rmp_mjx.rmp.leaves import (
+    JointLimitBarrier,
+    collision_near,
+    joint_limit_barrier,
+    soft_posture,
+)
+
+COLLISION, LIMIT, POSTURE = (
+    collision_near(),
+    joint_limit_barrier(),
+    soft_posture(np.zeros(0)),
+)
+RELAXATION, LIMIT_RELAXATION = rmp.OrientationRelaxation(), joint_limit_relaxation()
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """What is tuned; the defaults are the leaves' own (a test holds them together)."""
+    """What is tuned; the defaults are those of the leaves."""
 
-    mu: float = 7e-5
+    mu: float = COLLISION.mu
     """Collision: metric scale."""
-    eps: float = 0.007
+    eps: float = COLLISION.eps
     """Collision: velocity floor."""
-    eta: float = 20.0
+    eta: float = COLLISION.eta
     """Collision: damping [1/s]."""
-    r: float = 0.2
+    r: float = COLLISION.r
     """Collision: range [m]."""
-    margin: float = 0.005
+    margin: float = COLLISION.margin
     """Collision: margin [m]."""
-    k_out: float = 2.5e3
+    k_out: float = COLLISION.k_out
     """Collision: stiffness inside the margin [1/s^2]."""
-    limit_mu: float = 2.5e-3
+    limit_mu: float = LIMIT.mu
     """Joint limits: metric scale."""
-    limit_margin: float = 0.14
+    limit_margin: float = LIMIT.margin
     """Joint limits: margin [rad]."""
-    limit_r: float = 0.2
+    limit_r: float = LIMIT.r
     """Joint limits: range [rad]."""
-    limit_eta: float = 40.0
+    limit_eta: float = LIMIT.eta
     """Joint limits: damping [1/s]."""
-    limit_k_out: float = 2e3
+    limit_k_out: float = LIMIT.k_out
     """Joint limits: stiffness inside the margin [1/s^2]."""
-    kq: float = 2.5
+    kq: float = POSTURE.kq
     """Posture: stiffness [1/s^2]."""
-    posture: float = 0.02
+    posture: float = POSTURE.weight
     """Posture: weight."""
-    least: float = 1e-3
-    """Yielding: weight of the orientation at an obstacle."""
-    near: float = 0.015
-    """Yielding: clearance up to which it has that weight [m]."""
-    far: float = 0.07
-    """Yielding: clearance at which it begins [m]."""
-    stirring: float = 0.03
-    """Stirring: amplitude [m]."""
-    limit_least: float = 1e-3
-    """Yielding near joint limits: weight of the orientation at a limit."""
-    limit_far: float = 1.2
-    """Yielding near joint limits: distance at which it begins [rad]."""
+    min_weight: float = RELAXATION.min_weight
+    """Relaxation beside obstacles: least weight of the orientation."""
+    near: float = RELAXATION.near
+    """Relaxation beside obstacles: clearance up to which it has that weight [m]."""
+    far: float = RELAXATION.far
+    """Relaxation beside obstacles: clearance at which it begins [m]."""
+    dither: float = rmp.SetpointDither().amplitude
+    """Dither of the set-point: amplitude [m]."""
+    limit_min_weight: float = LIMIT_RELAXATION.min_weight
+    """Relaxation near joint limits: least weight of the orientation."""
+    limit_far: float = LIMIT_RELAXATION.far
+    """Relaxation near joint limits: distance at which it begins [rad]."""
 
     @staticmethod
     def suggest(trial: optuna.Trial) -> Parameters:
@@ -74,17 +84,19 @@ class Parameters:
             limit_k_out=trial.suggest_float("limit_k_out", 100.0, 5e3, log=True),
             kq=trial.suggest_float("kq", 0.3, 10.0, log=True),
             posture=trial.suggest_float("posture", 0.002, 0.05, log=True),
-            least=trial.suggest_float("least", 1e-4, 0.1, log=True),
+            min_weight=trial.suggest_float("min_weight", 1e-4, 0.1, log=True),
             near=trial.suggest_float("near", 0.005, 0.035),
             far=trial.suggest_float("far", 0.04, 0.2, log=True),
-            stirring=trial.suggest_float("stirring", 0.005, 0.05, log=True),
-            limit_least=trial.suggest_float("limit_least", 1e-4, 0.1, log=True),
+            dither=trial.suggest_float("dither", 0.005, 0.05, log=True),
+            limit_min_weight=trial.suggest_float(
+                "limit_min_weight", 1e-4, 0.1, log=True
+            ),
             limit_far=trial.suggest_float("limit_far", 0.3, 2.0, log=True),
         )
 
     def controller(self, robot: rmp.Robot) -> rmp.RMPVICES:
         """RMP-VICES with these leaves."""
-        collision = collision_near().replace(
+        collision = COLLISION.replace(
             mu=self.mu,
             eps=self.eps,
             eta=self.eta,
@@ -92,22 +104,27 @@ class Parameters:
             margin=self.margin,
             k_out=self.k_out,
         )
-        barrier = joint_limit_barrier().replace(
+        barrier = LIMIT.replace(
             mu=self.limit_mu,
             margin=self.limit_margin,
             r=self.limit_r,
             eta=self.limit_eta,
             k_out=self.limit_k_out,
         )
-        return rmp.RMPVICES(
-            robot,
+        leaves = rmp.Leaves(
             collision=collision,
             self_collision=collision,
             joint_limit=JointLimitBarrier(robot.q_lower, robot.q_upper, barrier),
-            posture=Posture(robot.q_home, kq=self.kq, kd=10.0, weight=self.posture),
-            yielding=Yielding(least=self.least, near=self.near, far=self.far),
-            stirring=Stirring(amplitude=self.stirring),
-            limit_yielding=limit_yielding().replace(
-                least=self.limit_least, far=self.limit_far
+            posture=soft_posture(robot.q_home).replace(kq=self.kq, weight=self.posture),
+        )
+        return rmp.RMPVICES(
+            robot,
+            leaves,
+            obstacle_relaxation=RELAXATION.replace(
+                min_weight=self.min_weight, near=self.near, far=self.far
             ),
+            limit_relaxation=LIMIT_RELAXATION.replace(
+                min_weight=self.limit_min_weight, far=self.limit_far
+            ),
+            dither=rmp.SetpointDither(amplitude=self.dither),
         )

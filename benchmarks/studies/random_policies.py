@@ -7,10 +7,10 @@ Random policies visit what a learning policy may visit. Run as
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +22,7 @@ from benchmarks.studies.safety_study import ENDING, EVENTS, Group, Study
 from envs.placement import LAYOUTS
 from rmp_mjx import runtime
 from rmp_mjx.control.torque import clip_torque
+from rmp_mjx.rmp import ScalarLeaf
 from rmp_mjx.rmp.leaves import (
     Barrier,
     JointLimitBarrier,
@@ -47,25 +48,49 @@ NEAR = 0.05
 """A clearance below this counts as near an obstacle [m]."""
 
 
-HOLDING = rmp.Yielding(least=1.0)
-"""The orientation never yields."""
-STILL = rmp.Stirring(amplitude=0.0)
-"""The set-point is never stirred."""
-PLAIN = {"yielding": HOLDING, "limit_yielding": HOLDING, "stirring": STILL}
+HOLDING = rmp.OrientationRelaxation(min_weight=1.0)
+"""The orientation is never relaxed."""
+STILL = rmp.SetpointDither(amplitude=0.0)
+"""The set-point is never dithered."""
+PLAIN: dict[str, Any] = {
+    "obstacle_relaxation": HOLDING,
+    "limit_relaxation": HOLDING,
+    "dither": STILL,
+}
 """Without our additions to the paper, in the same compiled program."""
 
 
-def _paper(robot: rmp.Robot, signs: str) -> rmp.RMPVICES:
-    leaf = PaperCollision(signs=signs)
+class PrintedCollision(PaperCollision):
+    """The paper's collision leaf with the signs that are printed.
+
+    The gate is max(xd, 0) and a = +eta xd, which is wrong for a distance that is
+    positive outside: the leaf acts on a body that leaves, and accelerates it.
+    """
+
+    def scalar(self, x, xd):
+        """Force and metric at distances ``x`` and speeds ``xd``, elementwise."""
+        return super().scalar(x, -xd)
+
+
+def _with_leaves(
+    robot: rmp.Robot, collision: ScalarLeaf | None = None, **changes: Any
+) -> rmp.Leaves:
+    """Default leaves but for these; one collision leaf for obstacles and links."""
+    if collision is not None:
+        changes |= {"collision": collision, "self_collision": collision}
+    return rmp.Leaves.default(robot).replace(**changes)
+
+
+def _paper(robot: rmp.Robot, leaf: PaperCollision) -> rmp.RMPVICES:
     limits = RMPflowJointLimit(robot.q_lower, robot.q_upper)
-    return rmp.RMPVICES(robot, leaf, leaf, limits, **PLAIN)
+    return rmp.RMPVICES(robot, _with_leaves(robot, leaf, joint_limit=limits), **PLAIN)
 
 
 def _off(robot: rmp.Robot) -> rmp.RMPVICES:
     """No safety leaf: barriers with zero weight, which share the compiled program."""
     off = Barrier(mu=0.0)
     limits = JointLimitBarrier(robot.q_lower, robot.q_upper, off)
-    return rmp.RMPVICES(robot, off, off, limits, **PLAIN)
+    return rmp.RMPVICES(robot, _with_leaves(robot, off, joint_limit=limits), **PLAIN)
 
 
 class _NoCurvature(Barrier):
@@ -92,7 +117,7 @@ class _Clipped(rmp.RMPVICES):
 def _collision(**changes: float) -> Make:
     """Default leaves with changed parameters of the collision leaves."""
     leaf = collision_near().replace(**changes)
-    return lambda robot: rmp.RMPVICES(robot, leaf, leaf)
+    return lambda robot: rmp.RMPVICES(robot, _with_leaves(robot, leaf))
 
 
 def _soft_wall(robot: rmp.Robot) -> rmp.RMPVICES:
@@ -101,17 +126,25 @@ def _soft_wall(robot: rmp.Robot) -> rmp.RMPVICES:
         for barrier in (collision_near(), joint_limit_barrier())
     )
     limits = JointLimitBarrier(robot.q_lower, robot.q_upper, limit)
-    return rmp.RMPVICES(robot, leaf, leaf, limits)
+    return rmp.RMPVICES(robot, _with_leaves(robot, leaf, joint_limit=limits))
 
 
 def _no_curvature(robot: rmp.Robot) -> rmp.RMPVICES:
-    leaf = _NoCurvature(**dataclasses.asdict(collision_near()))
-    limits = JointLimitBarrier(robot.q_lower, robot.q_upper)
-    return rmp.RMPVICES(robot, leaf, leaf, limits)
+    leaf = _NoCurvature(**vars(collision_near()))
+    return rmp.RMPVICES(robot, _with_leaves(robot, leaf))
 
 
 def _transit(robot: rmp.Robot) -> rmp.RMPVICES:
-    return rmp.RMPVICES(robot, collision_transit(), collision_transit())
+    return rmp.RMPVICES(robot, _with_leaves(robot, collision_transit()))
+
+
+def _no_self_collision(robot: rmp.Robot) -> rmp.RMPVICES:
+    return rmp.RMPVICES(robot, _with_leaves(robot, self_collision=Barrier(mu=0.0)))
+
+
+def _rmpflow_limits(robot: rmp.Robot) -> rmp.RMPVICES:
+    limits = RMPflowJointLimit(robot.q_lower, robot.q_upper)
+    return rmp.RMPVICES(robot, _with_leaves(robot, joint_limit=limits))
 
 
 CONTROLLERS: dict[str, tuple[Make, str]] = {
@@ -119,15 +152,15 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
     "rmp_vices": (rmp.RMPVICES, "defaults"),
     "transit": (_transit, "collision leaf for moving among obstacles"),
     "holding_orientation": (
-        lambda r: rmp.RMPVICES(r, yielding=HOLDING),
+        lambda r: rmp.RMPVICES(r, obstacle_relaxation=HOLDING),
         "orientation keeps its weight near obstacles",
     ),
     "holding_orientation_at_limits": (
-        lambda r: rmp.RMPVICES(r, limit_yielding=HOLDING),
+        lambda r: rmp.RMPVICES(r, limit_relaxation=HOLDING),
         "orientation keeps its weight near joint limits",
     ),
     "no_stirring": (
-        lambda r: rmp.RMPVICES(r, stirring=STILL),
+        lambda r: rmp.RMPVICES(r, dither=STILL),
         "no set-point dither near obstacles",
     ),
     "soft_wall": (_soft_wall, "a twentieth of the stiffness inside the margins"),
@@ -141,21 +174,21 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
     "long_range": (_collision(r=10.0), "collision leaves without a range"),
     "clipped_torque": (_Clipped, "each torque clipped separately"),
     "no_self_collision": (
-        lambda r: rmp.RMPVICES(r, self_collision=Barrier(mu=0.0)),
+        _no_self_collision,
         "self-collision leaf switched off",
     ),
     "no_safety": (_off, "attractors and posture only"),
     "rmpflow_limits": (
-        lambda r: rmp.RMPVICES(r, joint_limit=RMPflowJointLimit(r.q_lower, r.q_upper)),
+        _rmpflow_limits,
         "RMPflow's joint limiter at its authors' values",
     ),
     "rmp_vices_literal": (rmp.rmp_vices_literal, "the paper's formulas, no additions"),
     "paper_corrected": (
-        lambda r: _paper(r, "corrected"),
+        lambda r: _paper(r, PaperCollision()),
         "the paper's leaves, signs corrected, RMPflow's joint limiter",
     ),
     "paper_as_printed": (
-        lambda r: _paper(r, "as_printed"),
+        lambda r: _paper(r, PrintedCollision()),
         "the paper's leaves, signs as printed, RMPflow's joint limiter",
     ),
 }

@@ -63,23 +63,25 @@ def stack(ctrl: rmp.RMPVICES, q: Array, qd: Array, action: Array, center: Array)
     Returns:
         A (r, n) and b (r,) with A^T A the root's regularised metric and A^T b its f.
     """
-    robot, n = ctrl.robot, ctrl.robot.n
-    if ctrl.collision is None or ctrl.joint_limit is None or ctrl.posture is None:
+    robot, n, leaves = ctrl.robot, ctrl.robot.n, ctrl.leaves
+    if not isinstance(leaves.collision, ScalarLeaf):
+        raise ValueError("the rows are those of one leaf for all obstacles")
+    if leaves.joint_limit is None or leaves.posture is None:
         raise ValueError("the rows are those of a controller with all its branches")
     gap = functools.partial(distances, robot, center)
     d, rate, curvature = _second_jvp(gap, q, qd)
-    f, m = ctrl.collision.scalar(d, rate)
+    f, m = leaves.collision.scalar(d, rate)
     root = jnp.sqrt(m)
     J = jax.jacfwd(gap)(q)
     collision = root[:, None] * J, jnp.where(m > 0, f / root, 0.0) - root * curvature
 
-    f, m = ctrl.joint_limit.scalar(q, qd)
+    f, m = leaves.joint_limit.scalar(q, qd)
     root = jnp.sqrt(m)
     limit = root[:, None] * jnp.eye(n), jnp.where(m > 0, f / root, 0.0)
 
     arm = arm_state(robot, q, qd)
     site = site_state(robot, arm)
-    goal = ctrl.setpoint(q, ctrl.decode(action))
+    goal = ctrl.setpoint(q, ctrl.decode(action), 0.0)
     pull = goal.kp_pos * (goal.p_des - site.p) - critical_damping(goal.kp_pos) * site.v
     error = orientation_error(site.R, goal.R_des)
     turn = goal.kp_ori * error - critical_damping(goal.kp_ori) * site.w
@@ -88,8 +90,8 @@ def stack(ctrl: rmp.RMPVICES, q: Array, qd: Array, action: Array, center: Array)
 
     Mq, _ = dynamics(robot, arm)
     L = jnp.linalg.cholesky(Mq).T
-    w = jnp.sqrt(ctrl.posture.weight)
-    posture = w * L, w * (L @ ctrl.posture.acceleration(q, qd))
+    w = jnp.sqrt(leaves.posture.weight)
+    posture = w * L, w * (L @ leaves.posture.acceleration(q, qd))
     regulariser = jnp.sqrt(ctrl.regularizer) * L, jnp.zeros(n)
     parts = (collision, limit, position, orientation, posture, regulariser)
     A, b = zip(*parts, strict=True)
@@ -116,7 +118,7 @@ class RootSampler:
             ctrl: A controller without self-collision leaf; its collision leaf is
                 replaced at each call.
         """
-        if ctrl.self_collision is not None:
+        if ctrl.leaves.self_collision is not None:
             raise ValueError("root systems are drawn without a self-collision leaf")
         self.ctrl = ctrl
         robot = ctrl.robot
@@ -127,17 +129,17 @@ class RootSampler:
         self._qdd = jax.jit(self._all_accelerations)
 
     def _all_rows(self, leaf: ScalarLeaf, *states: Array) -> tuple[Array, Array]:
-        ctrl = self.ctrl.replace(collision=leaf)
+        ctrl = self.ctrl.with_collision(leaf)
         return jax.vmap(functools.partial(stack, ctrl))(*states)
 
     def _all_accelerations(self, leaf: ScalarLeaf, *states: Array) -> Array:
-        ctrl = self.ctrl.replace(collision=leaf)
+        ctrl = self.ctrl.with_collision(leaf)
 
         def one(q: Array, qd: Array, action: Array, center: Array) -> Array:
             table = np.array([[0.0, 0.0, TABLE]]), np.array([[0.0, 0.0, 1.0]])
             slots = rmp.Obstacles.empty(spheres=1, planes=1).with_planes(*table)
             slots = slots.with_spheres(center[None], np.full(1, RADIUS))
-            setpoint = ctrl.setpoint(q, ctrl.decode(action))
+            setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
             return ctrl(q, qd, setpoint, slots).qdd
 
         return jax.vmap(one)(*states)

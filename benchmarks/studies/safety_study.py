@@ -31,13 +31,10 @@ ENDING = ("collision", "self_collision", "joint_limit")
 SPHERES, RADIUS = 2, 0.05
 
 PARTS = (
-    "collision",
-    "self_collision",
-    "joint_limit",
-    "posture",
-    "yielding",
-    "limit_yielding",
-    "stirring",
+    "leaves",
+    "obstacle_relaxation",
+    "limit_relaxation",
+    "dither",
     "attractor_weight",
     "regularizer",
 )

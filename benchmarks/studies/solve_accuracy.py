@@ -226,7 +226,8 @@ def main(argv: list[str] | None = None) -> None:
     count, seconds = (16, 0.05) if args.quick else (SYSTEMS, 2.0)
     robot = rmp.Robot.load("jaco2")
     rows: list[Row] = []
-    sampler = RootSampler(rmp.RMPVICES(robot, self_collision=None))
+    leaves = rmp.Leaves.default(robot).replace(self_collision=None)
+    sampler = RootSampler(rmp.RMPVICES(robot, leaves))
     drawn = {}
     for cap in CAPS:
         leaf = collision_near().replace(cap=cap)

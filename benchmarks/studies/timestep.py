@@ -104,7 +104,7 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
 
     def policy_step(data, inputs):
         action, spheres = inputs
-        setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action))
+        setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action), 0.0)  # no dither
         obstacles = env.obstacles(data, spheres)
 
         def substep(carry, _):

@@ -3,8 +3,10 @@
 from rmp_mjx.control.action import ACTION_SIZE as ACTION_SIZE
 from rmp_mjx.control.action import ActionRange as ActionRange
 from rmp_mjx.control.avoidance import per_link as per_link
+from rmp_mjx.control.controller import Controller as Controller
+from rmp_mjx.control.dither import SetpointDither as SetpointDither
+from rmp_mjx.control.leaves import Leaves as Leaves
 from rmp_mjx.control.literal import rmp_vices_literal as rmp_vices_literal
+from rmp_mjx.control.relaxation import OrientationRelaxation as OrientationRelaxation
 from rmp_mjx.control.rmp_vices import RMPVICES as RMPVICES
-from rmp_mjx.control.stirring import Stirring as Stirring
 from rmp_mjx.control.vices import VICES as VICES
-from rmp_mjx.control.yielding import Yielding as Yielding

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from rmp_mjx.control.leaves import CollisionLeaf, leaf_of
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf
 from rmp_mjx.robot.kinematics import (
@@ -23,14 +22,6 @@ from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
 from rmp_mjx.shapes import Gap
 from rmp_mjx.vec import Vec
 from rmp_mjx.xla import materialize
-
-CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]
-"""A leaf for all obstacles, or one for each kind by name (None: not avoided)."""
-
-
-def leaf_of(leaf: CollisionLeaf, kind: str) -> ScalarLeaf | None:
-    """The leaf that avoids obstacles of this kind."""
-    return leaf[kind] if isinstance(leaf, Mapping) else leaf
 
 
 def per_link(robot: Robot, values: Float[ArrayLike, " n"]) -> Float[Array, " p"]:

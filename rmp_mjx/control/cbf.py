@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from rmp_mjx.control.avoidance import self_gaps
 from rmp_mjx.control.projection import project
@@ -16,6 +16,7 @@ from rmp_mjx.control.torque import clip_torque
 from rmp_mjx.control.vices import VICES
 from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Constant
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, arm_state, base_point
 from rmp_mjx.robot.model import Robot
@@ -43,7 +44,7 @@ class Barriers(NamedTuple):
     """Its acceleration while qdd = 0."""
     rows: Float[Array, "m n"]
     """Its gradient."""
-    active: Float[Array, " m"]
+    active: Bool[Array, " m"]
     """Whether it counts."""
 
 
@@ -69,19 +70,19 @@ class FilteredVICES(VICES):
     barrier functions" (2022).
     """
 
-    rate: Float[Array, ""] | float = 10.0
+    rate: Float[Constant, ""] | float = 10.0
     """Rate alpha at which a distance may shrink [1/s]."""
-    margin: Float[Array, ""] | float = 0.005
+    margin: Float[Constant, ""] | float = 0.005
     """Distance that is kept [m]."""
-    limit_margin: Float[Array, ""] | float = 0.12
+    limit_margin: Float[Constant, ""] | float = 0.12
     """Room that is kept to a joint's limit [rad]."""
-    penalty: Float[Array, ""] | float = 1e3
+    penalty: Float[Constant, ""] | float = 1e3
     """Cost of a squared violation over that of a squared change."""
 
     def __call__(
         self,
-        q: Float[Array, " n"],
-        qd: Float[Array, " n"],
+        q: Float[ArrayLike, " n"],
+        qd: Float[ArrayLike, " n"],
         setpoint: Setpoint,
         obstacles: Obstacles,
     ) -> ControlOutput:
@@ -90,8 +91,12 @@ class FilteredVICES(VICES):
         Returns:
             As `VICES`; diagnostics also has `solved`, 1 where the program converged and
             the constraints that it leaves out hold.
+
+        Raises:
+            ValueError: An argument has a wrong shape or dtype.
         """
         tau = super().__call__(q, qd, setpoint, obstacles).tau
+        q, qd = jnp.asarray(q), jnp.asarray(qd)
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
         wanted = psd_solve(Mq, tau - bias)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rmp_mjx.control.leaves import Leaves
 from rmp_mjx.control.rmp_vices import RMPVICES
 from rmp_mjx.rmp.leaves.collision import PaperCollision
 from rmp_mjx.rmp.leaves.joint_limit import RMPflowJointLimit
@@ -16,7 +17,7 @@ among them, 99 % of the float32 accelerations are within 20 % of float64's (90 %
 def rmp_vices_literal(robot: Robot) -> RMPVICES:
     r"""RMP-VICES with the formulas of the paper, their signs corrected, no additions.
 
-    The two impedance attractors (metric 1, never yielding), its collision leaf
+    The two impedance attractors (metric 1, never relaxed), its collision leaf
     $m = \max(-\dot x, 0)^2 / x^4, \; a = -\eta \dot x$, and RMPflow's joint
     limiter at its authors' values. No posture leaf, no self-collision leaf, no
     curvature, floor, margin or range. It is here to be compared with: nothing in it
@@ -44,14 +45,12 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
     Source: Shaw et al., "RMPs for Safe Impedance Control in Contact-Rich Manipulation"
     (2021), section III; the limiter from Cheng et al., "RMPflow" (2018).
     """
+    limiter = RMPflowJointLimit(robot.q_lower, robot.q_upper)
     return RMPVICES(
         robot,
-        collision=PaperCollision(),
-        self_collision=None,
-        joint_limit=RMPflowJointLimit(robot.q_lower, robot.q_upper),
-        posture=None,
-        yielding=None,
-        limit_yielding=None,
-        stirring=None,
+        Leaves(collision=PaperCollision(), joint_limit=limiter),
+        obstacle_relaxation=None,
+        limit_relaxation=None,
+        dither=None,
         regularizer=REGULARIZER,
     )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import ArrayLike, Float
 
 from rmp_mjx.control.vices import VICES
+from rmp_mjx.pytree import Constant
 from rmp_mjx.types import Action
 
 
@@ -16,10 +17,10 @@ class OSC(VICES):
     policy fits either. The stiffness is that of robosuite's OSC_POSE controller.
     """
 
-    kp: Float[Array, ""] | float = 150.0
+    kp: Float[Constant, ""] | float = 150.0
     """Stiffness in every direction [1/s^2]."""
 
-    def decode(self, action: Float[Array, " 12"]) -> Action:
+    def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
         """Physical units of a policy action in [-1, 1]^12."""
         free = super().decode(action)
         held = jnp.full_like(free.kp_pos, self.kp)

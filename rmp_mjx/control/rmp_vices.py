@@ -4,43 +4,30 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.control.action import ActionRange, compose_setpoint
+from rmp_mjx.control.arguments import check_obstacles, check_setpoint, check_state
 from rmp_mjx.control.avoidance import obstacle_branch, self_branch
-from rmp_mjx.control.stirring import Stirring
+from rmp_mjx.control.controller import ImpedanceController
+from rmp_mjx.control.dither import SetpointDither
+from rmp_mjx.control.leaves import CollisionLeaf, Leaves
+from rmp_mjx.control.relaxation import OrientationRelaxation, joint_limit_relaxation
 from rmp_mjx.control.torque import scale_torque
-from rmp_mjx.control.tree import rmp_vices_tree
-from rmp_mjx.control.yielding import Yielding, limit_yielding
-from rmp_mjx.names import unknown
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.pytree import Pytree
-from rmp_mjx.rmp import RMP, ScalarLeaf, evaluate, pullback, resolve
+from rmp_mjx.pytree import Constant
+from rmp_mjx.rmp import RMP, pullback, resolve
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
-from rmp_mjx.rmp.leaves.collision import collision_near
-from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
-from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import (
-    ArmState,
-    SiteState,
-    arm_state,
-    site_pose,
-    site_state,
-)
-from rmp_mjx.robot.model import Robot
-from rmp_mjx.shapes import KINDS
-from rmp_mjx.types import Action, ControlOutput, Setpoint
+from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_state
+from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.xla import materialize
 
 
-class RMPVICES(Pytree):
+class RMPVICES(ImpedanceController):
     r"""Variable-impedance control as the attractor of an RMP-tree (paper, section III).
 
     One call evaluates the tree at (q, qd), resolves its root in the inertia metric and
@@ -54,79 +41,40 @@ class RMPVICES(Pytree):
     to (coupled) operational-space control as $\epsilon \to 0$; the paper's
     Moore-Penrose inverse does not. The controller is a pytree: gains and leaf
     parameters are array leaves that can be traced, vmapped, differentiated and tuned.
-
-    Leave a branch out of the tree with `None`; leave it at `...` for the default.
     """
 
-    robot: Robot
-    """The arm."""
-    collision: ScalarLeaf | Mapping[str, ScalarLeaf | None] | Any | None = ...
-    """Leaf between every control point and obstacle, or one for each kind: `spheres`,
-    `planes`, `capsules`, `boxes` (None: not avoided; left out: the default). Parameters
-    may be arrays that broadcast against (obstacles, points): see `per_link`."""
-    self_collision: ScalarLeaf | Any | None = ...
-    """Leaf between the link capsules that can touch."""
-    joint_limit: ScalarLeaf | Any | None = ...
-    """Leaf on the joints."""
-    posture: Posture | Any | None = ...
-    """Rest configuration, in the inertia metric: fills the null space. The default's
-    spring is soft, so that the hand can turn past obstacles, and overdamped."""
-    attractor_weight: Float[Array, ""] | float = 1.0
+    leaves: Leaves = struct.field(default=None)
+    """The safety leaves and the posture; `Leaves.default(robot)` if not given."""
+    attractor_weight: Float[Constant, ""] | float = 1.0
     """Metric of the two impedance attractors."""
-    yielding: Yielding | Any | None = ...
-    """Weight of the orientation attractor beside spheres, capsules and boxes; a plane
-    cannot be gone round."""
-    limit_yielding: Yielding | Any | None = ...
-    """Weight of the orientation attractor near a joint's limit: a hand that can turn no
-    further still moves on. The lesser of the two weights counts."""
-    stirring: Stirring | Any | None = ...
-    """Motion of the set-point that frees a hand which stands beside such a body."""
-    regularizer: Float[Array, ""] | float = 1e-3
-    """The root's epsilon: damps accelerations that nothing asks for."""
-    action_range: ActionRange = struct.field(default_factory=ActionRange)
-    """Physical meaning of a policy action in [-1, 1]^12."""
-    jacobian: str = struct.field(pytree_node=False, default="closed_form")
-    """`closed_form` (fast) or `autodiff` (the generic tree, its definition)."""
+    obstacle_relaxation: OrientationRelaxation | None = struct.field(
+        default_factory=OrientationRelaxation
+    )
+    """Weight of the orientation attractor beside spheres, capsules and boxes. Planes do
+    not count: the hand cannot turn past a plane. None: always 1."""
+    limit_relaxation: OrientationRelaxation | None = struct.field(
+        default_factory=joint_limit_relaxation
+    )
+    """Weight of the orientation attractor near a joint limit, so that a hand that can
+    turn no further still moves on. The lesser of the two weights counts."""
+    dither: SetpointDither | None = struct.field(default_factory=SetpointDither)
+    """Motion of the set-point that frees a hand at rest beside such an obstacle."""
+    regularizer: Float[Constant, ""] | float = 1e-3
+    """The root's epsilon: damps accelerations that no leaf determines."""
 
     def __post_init__(self):
-        """Fill the defaults in and check the one static choice."""
-        if self.jacobian not in ("closed_form", "autodiff"):
-            raise ValueError(
-                f"jacobian must be 'closed_form' or 'autodiff', not {self.jacobian!r}"
-            )
-        robot = self.robot
-        defaults = {
-            "collision": collision_near,
-            "self_collision": collision_near,
-            "joint_limit": lambda: JointLimitBarrier(robot.q_lower, robot.q_upper),
-            "posture": lambda: Posture(q_0=robot.q_home, kq=2.5, kd=10.0),
-            "yielding": Yielding,
-            "limit_yielding": limit_yielding,
-            "stirring": Stirring,
-        }
-        for name, make in defaults.items():
-            if getattr(self, name) is ...:
-                object.__setattr__(self, name, make())
-        if isinstance(self.collision, Mapping):
-            kinds = tuple(KINDS.values())
-            for kind in self.collision:
-                if kind not in kinds:
-                    raise ValueError(unknown("kind of obstacle", kind, kinds))
-            leaves = dict.fromkeys(kinds, collision_near()) | dict(self.collision)
-            object.__setattr__(self, "collision", leaves)
+        """Fill in the default leaves, which depend on the robot."""
+        if self.leaves is None:
+            object.__setattr__(self, "leaves", Leaves.default(self.robot))
 
-    def decode(self, action: Float[Array, " 12"]) -> Action:
-        """Physical units of a policy action in [-1, 1]^12."""
-        return self.action_range.decode(action)
-
-    def setpoint(self, q: Float[Array, " n"], action: Action) -> Setpoint:
-        """Impedance target: the current site pose displaced by the action."""
-        return compose_setpoint(*site_pose(self.robot, q), action)
+    def with_collision(self, collision: CollisionLeaf | None) -> RMPVICES:
+        """The same controller with another collision leaf; see `Leaves`."""
+        return self.replace(leaves=self.leaves.with_collision(collision))
 
     def __call__(
         self,
-        q: Float[Array, " n"],
-        qd: Float[Array, " n"],
+        q: Float[ArrayLike, " n"],
+        qd: Float[ArrayLike, " n"],
         setpoint: Setpoint,
         obstacles: Obstacles,
     ) -> ControlOutput:
@@ -141,26 +89,29 @@ class RMPVICES(Pytree):
         Returns:
             Torque, acceleration, root RMP and diagnostics: `torque_scale` in [0, 1],
             `clearance` [m], the least distance of a control point to an obstacle, and
-            `orientation_weight` in [0, 1], what yielding leaves of the orientation.
+            `orientation_weight` in [0, 1], the relaxed weight of the orientation.
+
+        Raises:
+            ValueError: An argument has a wrong shape or dtype.
         """
+        check_state(self.robot.n, q, qd)
+        check_setpoint(setpoint)
+        check_obstacles(obstacles)
+        q, qd = jnp.asarray(q), jnp.asarray(qd)
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
-        branches, clearance, beside = self._avoidance(arm, obstacles)
-        yielded = self._yield(q, beside)
+        branches, clearance, body_clearance = self._avoidance(arm, obstacles)
+        orientation_weight = self._orientation_weight(q, body_clearance)
         site = site_state(self.robot, arm)
-        if self.stirring is not None:
-            stirred = self.stirring(setpoint.time, beside, site.v)
-            setpoint = setpoint.replace(p_des=setpoint.p_des + stirred)
-        if self.jacobian == "autodiff":
-            tree = rmp_vices_tree(self, setpoint, obstacles, Mq, yielded)
-            root = evaluate(tree, jnp.asarray(q), jnp.asarray(qd))
-        else:
-            branches += self._impedance(site, setpoint, yielded)
-            if self.joint_limit is not None:
-                branches.append(self.joint_limit(q, qd))
-            if self.posture is not None:
-                branches.append(self.posture(q, qd, Mq))
-            root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
+        if self.dither is not None:
+            moved = self.dither(setpoint.time, body_clearance, site.v)
+            setpoint = setpoint.replace(p_des=setpoint.p_des + moved)
+        branches += self._impedance(site, setpoint, orientation_weight)
+        if self.leaves.joint_limit is not None:
+            branches.append(self.leaves.joint_limit(q, qd))
+        if self.leaves.posture is not None:
+            branches.append(self.leaves.posture(q, qd, Mq))
+        root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
         qdd = resolve(root, self.regularizer * Mq)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
         tau, scale = scale_torque(dynamic, bias, self.robot.tau_max)
@@ -172,18 +123,22 @@ class RMPVICES(Pytree):
             diagnostics={
                 "torque_scale": scale,
                 "clearance": clearance,
-                "orientation_weight": yielded,
+                "orientation_weight": orientation_weight,
             },
         )
 
     def _impedance(
-        self, site: SiteState, setpoint: Setpoint, yielded: Float[Array, ""]
+        self, site: SiteState, setpoint: Setpoint, orientation_weight: Float[Array, ""]
     ) -> list[RMP]:
         """The two attractors of the end effector, pulled back to the joints."""
         weight = self.attractor_weight
         position = PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight)
         orientation = orientation_attractor(
-            site.R, site.w, setpoint.R_des, setpoint.kp_ori, weight=weight * yielded
+            site.R,
+            site.w,
+            setpoint.R_des,
+            setpoint.kp_ori,
+            weight=weight * orientation_weight,
         )
         return [
             pullback(position(site.p, site.v), site.J_pos, site.Jdot_qd_pos),
@@ -193,29 +148,34 @@ class RMPVICES(Pytree):
     def _avoidance(
         self, arm: ArmState, obstacles: Obstacles
     ) -> tuple[list[RMP], Float[Array, ""], Float[Array, ""]]:
-        """The collision branches on the joints, the clearance, that to bodies."""
+        """Collision RMPs on the joints, the least clearance, and that without planes.
+
+        Clearances are in m, and infinite if there is no obstacle.
+        """
         branches, nearest = [], {}
-        if self.collision is not None:
-            rmp, nearest = obstacle_branch(self.robot, arm, obstacles, self.collision)
+        if self.leaves.collision is not None:
+            rmp, nearest = obstacle_branch(
+                self.robot, arm, obstacles, self.leaves.collision
+            )
             branches.append(rmp)
-        if self.self_collision is not None:
-            branches.append(self_branch(self.robot, arm, self.self_collision))
+        if self.leaves.self_collision is not None:
+            branches.append(self_branch(self.robot, arm, self.leaves.self_collision))
         infinite = jnp.array(jnp.inf, arm.p.dtype)
         bodies = [d for kind, d in nearest.items() if kind != "planes"]
-        clearance, beside = (
+        clearance, body_clearance = (
             functools.reduce(jnp.minimum, distances, infinite)
             for distances in (nearest.values(), bodies)
         )
-        return branches, clearance, beside
+        return branches, clearance, body_clearance
 
-    def _yield(
-        self, q: Float[Array, " n"], beside: Float[Array, ""]
+    def _orientation_weight(
+        self, q: Float[Array, " n"], body_clearance: Float[Array, ""]
     ) -> Float[Array, ""]:
-        """Weight of the orientation, from the joints and the clearance to bodies."""
-        weight = jnp.ones_like(beside)
-        if self.yielding is not None:
-            weight = jnp.minimum(weight, self.yielding(beside))
-        if self.limit_yielding is not None:
+        """Weight of the orientation: the lesser of the two relaxations."""
+        weight = jnp.ones_like(body_clearance)
+        if self.obstacle_relaxation is not None:
+            weight = jnp.minimum(weight, self.obstacle_relaxation(body_clearance))
+        if self.limit_relaxation is not None:
             room = jnp.minimum(q - self.robot.q_lower, self.robot.q_upper - q)
-            weight = jnp.minimum(weight, self.limit_yielding(jnp.min(room)))
+            weight = jnp.minimum(weight, self.limit_relaxation(jnp.min(room)))
         return weight

@@ -6,64 +6,61 @@ evaluation in `rmp_vices` is held to this tree by the tests.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from rmp_mjx.control.avoidance import CollisionLeaf, leaf_of
+from rmp_mjx.control.leaves import CollisionLeaf, Leaves, leaf_of
 from rmp_mjx.math import exp_so3, safe_norm
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp import RMP, Leaf, Node, ScalarLeaf, Siblings, TaskMap, identity_map
 from rmp_mjx.rmp.leaves.attractor import OrientationAttractor, PositionAttractor
 from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.kinematics import base_point, forward_kinematics, site_pose
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.shapes import KINDS, Boxes, Capsules, Planes, Spheres
+from rmp_mjx.shapes import KINDS, Boxes, Capsules, Planes, Shape, Spheres
 from rmp_mjx.types import Setpoint
-
-if TYPE_CHECKING:
-    from rmp_mjx.control.rmp_vices import RMPVICES
 
 
 def rmp_vices_tree(
-    ctrl: RMPVICES,
+    robot: Robot,
+    leaves: Leaves,
     setpoint: Setpoint,
     obstacles: Obstacles,
     Mq: Float[Array, "n n"],
-    yielded: Float[Array, ""],
+    attractor_weight: Float[Constant, ""] | float,
+    orientation_weight: Float[Constant, ""] | float,
 ) -> Node:
     """The controller's tree with the joints at its root (the paper's figure 2).
 
     Args:
-        ctrl: Supplies the robot and the leaves.
-        setpoint: Impedance target.
+        robot: The arm.
+        leaves: All leaves but the attractors.
+        setpoint: Impedance target, the dither included.
         obstacles: Obstacle slots.
         Mq: Inertia, the metric of the posture leaf.
-        yielded: Weight of the edge to the orientation attractor, in this state.
+        attractor_weight: Metric of the two attractors.
+        orientation_weight: Further weight of the orientation attractor, in this state.
     """
-    robot, weight = ctrl.robot, ctrl.attractor_weight
-    turning = weight * yielded
+    turning = attractor_weight * orientation_weight
+    position = PositionAttractor(
+        setpoint.p_des, setpoint.kp_pos, weight=attractor_weight
+    )
+    orientation = OrientationAttractor(setpoint.R_des, setpoint.kp_ori, weight=turning)
     children: list[Node | Siblings | Leaf] = [
-        Node(
-            TaskMap(lambda q: site_pose(robot, q)[0]),
-            (PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight),),
-        ),
-        Node(
-            TaskMap(lambda q: site_pose(robot, q)[1]),
-            (OrientationAttractor(setpoint.R_des, setpoint.kp_ori, weight=turning),),
-        ),
+        Node(TaskMap(lambda q: site_pose(robot, q)[0]), (position,)),
+        Node(TaskMap(lambda q: site_pose(robot, q)[1]), (orientation,)),
     ]
-    if ctrl.joint_limit is not None:
-        children.append(ctrl.joint_limit)
-    if ctrl.posture is not None:
-        children.append(InertialPosture(ctrl.posture, Mq))
-    if ctrl.collision is not None and obstacles.kinds and robot.points.segment:
-        children.append(_point_nodes(robot, obstacles, ctrl.collision))
-    if ctrl.self_collision is not None and robot.capsules.pairs:
-        children.append(_self_node(robot, ctrl.self_collision))
+    if leaves.joint_limit is not None:
+        children.append(leaves.joint_limit)
+    if leaves.posture is not None:
+        children.append(InertialPosture(leaves.posture, Mq))
+    if leaves.collision is not None and obstacles.kinds and robot.points.segment:
+        children.append(_point_nodes(robot, obstacles, leaves.collision))
+    if leaves.self_collision is not None and robot.capsules.pairs:
+        children.append(_self_node(robot, leaves.self_collision))
     return Node(identity_map(), tuple(children))
 
 
@@ -85,8 +82,8 @@ class Masked(Leaf):
 
     leaf: ScalarLeaf
     """The leaf."""
-    active: Float[Array, " 1"]
-    """1 for a slot in use, else 0."""
+    active: Bool[Array, " 1"]
+    """Whether the slot is in use."""
 
     def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
         """RMP at a distance and its rate."""
@@ -114,8 +111,8 @@ def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: CollisionLeaf) -> Sib
             params, rates = _moving(kind)
             params["rho"] = jnp.full(slots, points.radius[k])
             rates["rho"] = jnp.zeros(slots)
-            active = kind.active & ~(kind.worked & bool(points.hand[k]))
-            active = jnp.asarray(active, jnp.result_type(float))[:, None]
+            active = kind.active & ~(kind.hand_may_touch & bool(points.hand[k]))
+            active = jnp.asarray(active)[:, None]
             masked = Masked(_at_point(own, (slots, len(one_hot)), k), active)
             distance = TaskMap(DISTANCE[type(kind)], params, rates)
             siblings.append(Siblings(Node(distance, (masked,))))
@@ -131,10 +128,10 @@ def _at_point(leaf: ScalarLeaf, shape: tuple[int, int], k: int) -> ScalarLeaf:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, shape)[:, k], leaf)
 
 
-def _moving(kind: Any) -> tuple[dict[str, Array], dict[str, Array]]:
+def _moving(kind: Shape) -> tuple[dict[str, Array], dict[str, Array]]:
     """Parameters of an obstacle's distance map and their rates."""
-    fields = {f: getattr(kind, f) for f in kind.__dataclass_fields__}
-    del fields["active"], fields["worked"]
+    fields = dict(vars(kind))
+    del fields["active"], fields["hand_may_touch"]
     velocity = fields.pop("velocity")
     spin = fields.pop("angular_velocity", None)
     rates = jax.tree.map(jnp.zeros_like, fields)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.control.action import ActionRange, compose_setpoint
+from rmp_mjx.control.arguments import check_obstacles, check_setpoint, check_state
+from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.control.torque import clip_torque
 from rmp_mjx.math import critical_damping, orientation_error, psd_solve
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.pytree import Pytree
+from rmp_mjx.pytree import Constant
+from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import arm_state, site_pose, site_state
-from rmp_mjx.robot.model import Robot
-from rmp_mjx.types import Action, ControlOutput, Setpoint
+from rmp_mjx.robot.kinematics import arm_state, site_state
+from rmp_mjx.types import ControlOutput, Setpoint
 
 
-class VICES(Pytree):
+class VICES(ImpedanceController):
     r"""Decoupled operational-space impedance control (paper, eq. 2).
 
     $$
@@ -32,25 +32,13 @@ class VICES(Pytree):
     by joint. It takes obstacles and ignores them.
     """
 
-    robot: Robot
-    """The arm."""
-    kq: Float[Array, ""] | float = 10.0
+    kq: Float[Constant, ""] | float = 10.0
     """Posture stiffness in the null space [1/s^2]."""
-    action_range: ActionRange = struct.field(default_factory=ActionRange)
-    """Physical meaning of a policy action in [-1, 1]^12."""
-
-    def decode(self, action: Float[Array, " 12"]) -> Action:
-        """Physical units of a policy action in [-1, 1]^12."""
-        return self.action_range.decode(action)
-
-    def setpoint(self, q: Float[Array, " n"], action: Action) -> Setpoint:
-        """Impedance target: the current site pose displaced by the action."""
-        return compose_setpoint(*site_pose(self.robot, q), action)
 
     def __call__(
         self,
-        q: Float[Array, " n"],
-        qd: Float[Array, " n"],
+        q: Float[ArrayLike, " n"],
+        qd: Float[ArrayLike, " n"],
         setpoint: Setpoint,
         obstacles: Obstacles,
     ) -> ControlOutput:
@@ -59,8 +47,14 @@ class VICES(Pytree):
         Returns:
             Torque, the acceleration it gives, that acceleration as an RMP in the
             inertia metric, and diagnostics: `torque_scale` in [0, 1].
+
+        Raises:
+            ValueError: An argument has a wrong shape or dtype.
         """
-        del obstacles
+        check_state(self.robot.n, q, qd)
+        check_setpoint(setpoint)
+        check_obstacles(obstacles)
+        q, qd = jnp.asarray(q), jnp.asarray(qd)
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
         site = site_state(self.robot, arm)
@@ -77,7 +71,7 @@ class VICES(Pytree):
         wrench = jnp.concatenate(
             [psd_solve(G[:3, :3], a_pos), psd_solve(G[3:, 3:], a_ori)]
         )
-        qdd_0 = self.kq * (self.robot.q_home - q) - critical_damping(self.kq) * qd
+        qdd_0 = Posture(self.robot.q_home, kq=self.kq).acceleration(q, qd)
         null = _dot(Mq, qdd_0) - _dot(J.T, psd_solve(G, _dot(J, qdd_0)))
         dynamic = _dot(J.T, wrench) + null
         tau, scale = clip_torque(dynamic + bias, jnp.asarray(self.robot.tau_max))

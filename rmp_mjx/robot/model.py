@@ -116,8 +116,8 @@ class Robot(Pytree):
     def __repr__(self) -> str:
         """Name, joints, end effector and control points on one line."""
         return (
-            f"Robot '{self.name}': {self.n} joints to site '{self.site_name}', "
-            f"{len(self.points.segment)} control points"
+            f"Robot('{self.name}', {self.n} joints to site '{self.site_name}', "
+            f"{len(self.points.segment)} control points)"
         )
 
     @property

@@ -16,7 +16,7 @@ QUICK = {"xla_backend_optimization_level": 0}
 
 def _controlled(ctrl, q, qd, action, obstacles):
     def one(q, qd, action, obstacles):
-        setpoint = ctrl.setpoint(q, ctrl.decode(action))
+        setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
         return ctrl(q, qd, setpoint, obstacles)
 
     return jax.vmap(one)(q, qd, action, obstacles)
@@ -78,7 +78,7 @@ def obstacles():
     """`obstacles(seed)`: every kind, moving and turning, placed about the arm.
 
     Other obstacles for each of the BATCH states; one sphere slot stays unused, and one
-    sphere is there for the hand to work on.
+    sphere may be touched by the hand.
     """
 
     def draw(seed=0, scale=0.4, speed=1.0):
@@ -92,7 +92,10 @@ def obstacles():
             up = np.array([[0.0, 0.0, 1.0]])
             return (
                 slots.with_spheres(
-                    sphere, np.array([0.05, 0.1]), sphere_v, np.array([False, True])
+                    sphere,
+                    np.array([0.05, 0.1]),
+                    sphere_v,
+                    hand_may_touch=np.array([False, True]),
                 )
                 .with_planes(-0.1 * up, up, floor_v)
                 .with_capsules(ends[:1], ends[1:], 0.05, *capsule_v)

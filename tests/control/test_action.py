@@ -62,7 +62,8 @@ def test_a_non_finite_entry_counts_as_zero(bad):
 
 
 def test_a_wrong_size_is_refused():
-    with pytest.raises(ValueError, match=r"an action has 12 entries.*got shape \(6,\)"):
+    message = r"action must be a float array of shape \(12,\), got float32 \(6,\)"
+    with pytest.raises(ValueError, match=message):
         RANGE.decode(jnp.zeros(6))
 
 
@@ -87,7 +88,7 @@ def test_setpoint_displaces_the_pose_in_the_world_frame():
     p, R = jnp.array([0.1, 0.2, 0.3]), exp_so3(jnp.array([0.5, -1.0, 0.3]))
     kp = jnp.array([10.0, 20.0, 30.0])
     setpoint = compose_setpoint(
-        p, R, Action(jnp.array([0.01, 0, 0]), jnp.array([0, 0, 0.2]), kp, 2 * kp)
+        p, R, Action(jnp.array([0.01, 0, 0]), jnp.array([0, 0, 0.2]), kp, 2 * kp), 0.7
     )
     np.testing.assert_allclose(setpoint.p_des, [0.11, 0.2, 0.3], rtol=1e-6)
     c, s = np.cos(0.2), np.sin(0.2)
@@ -95,3 +96,4 @@ def test_setpoint_displaces_the_pose_in_the_world_frame():
     np.testing.assert_allclose(setpoint.R_des, about_world_z @ R, atol=1e-6)
     np.testing.assert_array_equal(setpoint.kp_pos, kp)
     np.testing.assert_array_equal(setpoint.kp_ori, 2 * kp)
+    assert setpoint.time == np.float32(0.7)

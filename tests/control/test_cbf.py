@@ -47,7 +47,7 @@ def run(filtered, states):
     @jax.jit(compiler_options=QUICK)
     def every(q, qd, action):
         def one(q, qd, action):
-            setpoint = filtered.setpoint(q, filtered.decode(action))
+            setpoint = filtered.setpoint(q, filtered.decode(action), 0.0)
             arm = arm_state(filtered.robot, q, qd)
             return (
                 filtered(q, qd, setpoint, slots()),

@@ -30,8 +30,7 @@ def gradient():
 
 def _parts(ctrl):
     """Everything tunable of the controller."""
-    names = ("collision", "self_collision", "joint_limit", "posture")
-    names += ("yielding", "limit_yielding")
+    names = ("leaves", "obstacle_relaxation", "limit_relaxation", "dither")
     parts = {name: getattr(ctrl, name) for name in names}
     parts |= {"attractor_weight": 1.0, "regularizer": 1e-3}
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), parts)
@@ -62,7 +61,7 @@ def test_every_gradient_is_finite(robot, ctrl, gradient, pose, speed, touching, 
     p, R = (np.asarray(x) for x in _pose(robot, q))
     c, s = np.cos(turn), np.sin(turn)
     R_des = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], "f") @ R
-    setpoint = Setpoint(p, R_des, np.full(3, 100.0, "f"), np.full(3, 50.0, "f"))
+    setpoint = Setpoint(p, R_des, np.full(3, 100.0, "f"), np.full(3, 50.0, "f"), 0.6)
     centers = np.asarray(_points(robot, q))[[20, 50]]
     found = gradient(_parts(ctrl), q, qd, setpoint, centers, np.full(2, touching), ctrl)
     for path, leaf in jax.tree_util.tree_leaves_with_path(found):

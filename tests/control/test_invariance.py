@@ -94,9 +94,8 @@ def test_switched_off_obstacles_are_no_obstacles(run64, ctrl, inputs):
         }
     )
     out = run64(ctrl, q, qd, action, off)
-    weightless = ctrl.replace(
-        collision=ctrl.collision.replace(mu=0.0),
-        yielding=ctrl.yielding.replace(least=1.0),
+    weightless = ctrl.with_collision(ctrl.leaves.collision.replace(mu=0.0)).replace(
+        obstacle_relaxation=ctrl.obstacle_relaxation.replace(min_weight=1.0)
     )
     np.testing.assert_array_equal(out.tau, run64(weightless, *inputs).tau)
     assert np.all(np.isinf(out.diagnostics["clearance"]))
@@ -139,11 +138,11 @@ def test_clearance_is_the_distance_to_the_nearest_control_point(
             for (body, x, rho), hand in zip(
                 robot.control_points, robot.points.hand, strict=True
             )
-            for center, radius, worked in zip(
+            for center, radius, touch in zip(
                 *(near.spheres.center[k, :2], near.spheres.radius[k, :2]),
-                near.spheres.worked[k, :2],
+                near.spheres.hand_may_touch[k, :2],
                 strict=True,
             )
-            if not (hand and worked)
+            if not (hand and touch)
         ]
         np.testing.assert_allclose(clearance[k], min(gaps), atol=1e-12)

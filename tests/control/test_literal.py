@@ -28,11 +28,11 @@ def act(literal):
     @jax.jit(compiler_options=QUICK)
     def run(qd, center):
         slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
-        setpoint = literal.setpoint(Q, literal.decode(ACTION))
+        setpoint = literal.setpoint(Q, literal.decode(ACTION), 0.0)
         arm = arm_state(literal.robot, Q, qd)
         out = literal(Q, qd, setpoint, slots)
         Mq, _ = dynamics(literal.robot, arm)
-        limiter = literal.joint_limit.scalar(Q, qd)[1]
+        limiter = literal.leaves.joint_limit.scalar(Q, qd)[1]
         return out, site_state(literal.robot, arm), Mq, limiter
 
     def call(qd, center):

@@ -1,13 +1,17 @@
 """The controller as a pytree, and under jit, on an arm that compiles fast."""
 
+import copy
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx import RMPVICES, VICES, Obstacles, Robot
+from rmp_mjx import RMPVICES, VICES, Leaves, Obstacles, Robot, rmp_vices_literal
+from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx.control.osc import OSC
 from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 
@@ -34,7 +38,7 @@ def torque(traces):
     @functools.partial(jax.jit, compiler_options=QUICK)
     def torque(ctrl, q, qd, action, obstacles):
         traces.append(1)
-        return ctrl(q, qd, ctrl.setpoint(q, ctrl.decode(action)), obstacles).tau
+        return ctrl(q, qd, ctrl.setpoint(q, ctrl.decode(action), 0.0), obstacles).tau
 
     return torque
 
@@ -57,9 +61,10 @@ def test_leaves_are_numbers_and_survive_a_round_trip(small, torque, near):
 def test_jit_equals_eager(small, torque, near):
     """1e-4 of the torque: float32, with other fusions. Without the branches that take
     longest to run operation by operation."""
-    bare = small.replace(self_collision=None, joint_limit=None)
+    leaves = small.leaves.replace(self_collision=None, joint_limit=None)
+    bare = small.replace(leaves=leaves)
     q, qd, action = (jnp.asarray(x) for x in STATE)
-    eager = bare(q, qd, bare.setpoint(q, bare.decode(action)), near).tau
+    eager = bare(q, qd, bare.setpoint(q, bare.decode(action), 0.0), near).tau
     compiled = torque(bare, *STATE, near)
     np.testing.assert_allclose(compiled, eager, rtol=1e-4, atol=1e-4)
 
@@ -71,8 +76,8 @@ def test_new_values_do_not_retrace(small, torque, near, traces):
     torque(small, q + 1, qd - 1, -action, near)
     torque(small, q, qd, action, near.with_spheres(np.ones((2, 3)), 0.2))
     torque(small.replace(regularizer=1e-2), q, qd, action, near)
-    leaf = small.collision.replace(mu=1e-2, cap=10.0)
-    torque(small.replace(collision=leaf), q, qd, action, near)
+    leaf = small.leaves.collision.replace(mu=1e-2, cap=10.0)
+    torque(small.with_collision(leaf), q, qd, action, near)
     assert len(traces) == before
 
 
@@ -81,8 +86,8 @@ def test_vmap_over_a_leaf_parameter_equals_a_loop(small, torque, near):
     values = jnp.array([1e-5, 1e-3, 1e-1])
 
     def tuned(mu, eps):
-        leaf = small.collision.replace(mu=mu)
-        return small.replace(collision=leaf, regularizer=eps)
+        leaf = small.leaves.collision.replace(mu=mu)
+        return small.with_collision(leaf).replace(regularizer=eps)
 
     def at(mu, eps):
         return torque.__wrapped__(tuned(mu, eps), *STATE, near)
@@ -106,44 +111,146 @@ def test_vmap_over_states_equals_a_loop(small, torque, near):
 
 
 def test_any_branch_can_be_left_out(small, near):
-    """None takes a branch out; the output keeps its shape and stays finite."""
+    """None takes a branch out; the output keeps its shape."""
     q = STATE[0]
-    everything = ("collision", "self_collision", "joint_limit", "posture")
-    for names in (everything, everything[:1]):
-        bare = small.replace(**dict.fromkeys(names))
+
+    def output(ctrl):
+        setpoint = ctrl.setpoint(q, ctrl.decode(STATE[2]), 0.0)
+        return ctrl(q, q, setpoint, near)
+
+    for leaves in (Leaves(), small.leaves.replace(collision=None)):
+        bare = small.replace(leaves=leaves)
         assert len(jax.tree.leaves(bare)) < len(jax.tree.leaves(small))
-        out = jax.eval_shape(
-            lambda q, b=bare: b(q, q, b.setpoint(q, b.decode(jnp.zeros(12))), near), q
-        )
+        out = jax.eval_shape(output, bare)
         assert out.tau.shape == out.qdd.shape == (3,)
-    assert RMPVICES(small.robot, collision=None).posture is not None
 
 
 def test_an_arm_among_no_obstacles_has_infinite_clearance(small):
     q, qd, action = (jnp.asarray(x) for x in STATE)
-    bare = small.replace(self_collision=None, joint_limit=None, posture=None)
+    bare = small.replace(leaves=Leaves(collision=small.leaves.collision))
 
     @functools.partial(jax.jit, compiler_options=QUICK)
     def run(ctrl, q):
-        setpoint = ctrl.setpoint(q, ctrl.decode(action))
+        setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
         return ctrl(q, qd, setpoint, Obstacles.empty())
 
     out = run(bare, q)
     assert np.isinf(out.diagnostics["clearance"]) and np.isfinite(out.tau).all()
 
 
-def test_both_controllers_answer_in_the_same_form(small, near):
-    q = jnp.zeros(3)
-    shapes = []
-    for ctrl in (small, VICES(small.robot)):
-        out = jax.eval_shape(
-            lambda q, c=ctrl: c(q, q, c.setpoint(q, c.decode(jnp.zeros(12))), near), q
-        )
-        assert "torque_scale" in out.diagnostics
-        shapes.append([out.tau.shape, out.qdd.shape, out.f.shape, out.M.shape])
-    assert shapes[0] == shapes[1] == [(3,), (3,), (3,), (3, 3)]
+# What JAX users do with a callable pytree.
+
+CONTROLLERS = {
+    "rmp_vices": RMPVICES,
+    "vices": VICES,
+    "vices_cbf": FilteredVICES,
+    "osc": OSC,
+    "rmp_vices_literal": rmp_vices_literal,
+}
 
 
-def test_an_unknown_jacobian_setting_is_refused(small):
-    with pytest.raises(ValueError, match="must be 'closed_form' or 'autodiff'"):
-        RMPVICES(small.robot, jacobian="numeric")
+quick = functools.partial(jax.jit, compiler_options=QUICK)
+
+
+def in_a_scan(f):
+    """Two control steps at one state, as the environments run them."""
+
+    def loop(q, qd, setpoint, near):
+        def step(state, _):
+            return state, f(*state, setpoint, near).tau
+
+        return jax.lax.scan(step, (q, qd), length=2)[1]
+
+    return loop
+
+
+TRANSFORMS = {
+    "jit": jax.jit,
+    "vmap": lambda f: jax.vmap(f, in_axes=(None, 0, None, None)),
+    "jacobian": lambda f: lambda *args: jax.jacfwd(f)(*args).tau,
+    "checkpoint": jax.checkpoint,
+    "scan": in_a_scan,
+}
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_transformations_take_a_controller_like_a_function(small, near, name):
+    """They give the same program as with a function that calls it; so does a copy."""
+    ctrl = CONTROLLERS[name](small.robot)
+    q, qd, action = (jnp.asarray(x) for x in STATE)
+    args = (q, jnp.stack([qd, qd]), ctrl.setpoint(q, ctrl.decode(action), 0.4), near)
+    again = copy.deepcopy(ctrl)
+
+    def plain(q, qd, setpoint, obstacles):
+        return ctrl(q, qd, setpoint, obstacles)
+
+    for how, transform in TRANSFORMS.items():
+        given = args if how == "vmap" else (q, qd, *args[2:])
+
+        def program(f, transform=transform, given=given):
+            jaxpr = str(jax.make_jaxpr(transform(f))(*given))
+            named = re.sub(r"<?unnamed function>?", "plain", jaxpr)
+            return " ".join(named.split())
+
+        assert program(ctrl) == program(plain), how
+        if how == "jit":
+            assert program(again) == program(plain)
+
+
+def test_a_scan_of_the_jitted_controller_gives_its_torque(small, near):
+    """Run, not only traced. 1e-4: other fusions in float32."""
+    q, qd, action = (jnp.asarray(x) for x in STATE)
+    ctrl = small.replace(leaves=small.leaves.replace(self_collision=None))
+    args = (q, qd, ctrl.setpoint(q, ctrl.decode(action), 0.4), near)
+    tau = quick(ctrl)(*args).tau
+    scanned = quick(in_a_scan(ctrl))(*args)
+    np.testing.assert_allclose(scanned, [tau, tau], rtol=1e-4, atol=1e-4)
+
+
+def test_a_gradient_by_the_controller_is_a_controller(small, near):
+    """Every parameter's derivative, at its place."""
+    q, qd, action = (jnp.asarray(x) for x in STATE)
+    leaves = small.leaves.replace(self_collision=None)
+    ctrl = jax.tree.map(jnp.float32, small.replace(leaves=leaves))
+
+    @quick
+    @jax.grad
+    def slope(ctrl):
+        setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.4)
+        return jnp.sum(ctrl(q, qd, setpoint, near).tau ** 2)
+
+    found = slope(ctrl)
+    assert type(found) is RMPVICES
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(found))
+    assert found.regularizer != 0.0 and found.leaves.posture.kq != 0.0
+
+
+def test_controllers_are_compared_by_value(small):
+    again = RMPVICES(Robot.from_mjcf(GRIPPER, site="tip", spacing=0.1))
+    assert again == small and hash(again) == hash(small)
+    assert small.robot == again.robot and small.leaves == again.leaves
+    assert small != small.replace(regularizer=1e-2)
+    assert small != small.with_collision(None)
+    assert small != VICES(small.robot)
+    assert small.robot != small.robot.replace(q_home=small.robot.q_home + 1e-9)
+    assert len({small, again, small.replace(dither=None)}) == 2
+
+
+def test_a_controller_is_printed_in_a_few_lines(small):
+    lines = repr(small).splitlines()
+    assert len(lines) <= 12 and max(map(len, lines)) <= 90
+    assert repr(small.robot).startswith("Robot('arm', 3 joints to site 'tip'")
+    assert lines[1].strip() == f"robot={small.robot},"
+    assert "collision=Barrier(mu=7e-05, eps=0.007, r=0.2" in repr(small)
+    assert repr(VICES(small.robot)) == f"VICES(robot={small.robot})"
+    relaxed = small.replace(dither=None, regularizer=np.float32(0.1))
+    assert "dither=None" in repr(relaxed) and "regularizer=0.1" in repr(relaxed)
+
+    @jax.jit
+    def traced(ctrl):
+        shown.append(repr(ctrl))
+        return ctrl.regularizer
+
+    shown = []
+    traced(small)
+    assert "regularizer=float32[]" in shown[0]

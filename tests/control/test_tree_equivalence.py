@@ -1,6 +1,5 @@
 """The fast evaluation against the tree that defines it, in float64."""
 
-import dataclasses
 import functools
 
 import jax
@@ -8,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx import RMPVICES, Node, Siblings, per_link
+from benchmarks.autodiff import AutodiffRMPVICES
+from rmp_mjx import RMPVICES, Leaves, Node, Siblings, per_link
 from rmp_mjx.control.tree import rmp_vices_tree
-from rmp_mjx.rmp.leaves import GDSCollision, collision_near, collision_transit
+from rmp_mjx.rmp.leaves import PaperCollision, collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 from tests.control.conftest import QUICK
@@ -36,7 +36,7 @@ def varied(robot):
         "spheres": collision_transit(),
         "planes": near.replace(margin=per_link(robot, 5e-3 * np.arange(7.0))),
         "capsules": None,
-        "boxes": GDSCollision(mu=1e-3, eps=0.1, r=0.3, cap=1e3),
+        "boxes": PaperCollision(cap=1e3),
     }
 
 
@@ -46,8 +46,9 @@ def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, varied):
     1e-9 of the largest entry: rounding of metrics that span 1e6. The acceleration gets
     the root's condition on top: 1e-7 of its largest entry.
     """
-    fast = run64(RMPVICES(robot, varied), *inputs)
-    slow = run64(RMPVICES(robot, varied, jacobian="autodiff"), *inputs)
+    leaves = Leaves.default(robot).with_collision(varied)
+    fast = run64(RMPVICES(robot, leaves), *inputs)
+    slow = run64(AutodiffRMPVICES(robot, leaves), *inputs)
     assert np.quantile(fast.diagnostics["clearance"], [0.1, 0.9]).tolist() < [0.0, 0.2]
     weight = fast.diagnostics["orientation_weight"]
     assert weight.max() > 50 * weight.min()
@@ -61,13 +62,13 @@ def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):
     """To rounding: 1e-9 of the largest entry."""
     near, n = collision_near(), len(robot.points.segment)
     each = {"boxes": near, "planes": near.replace(mu=np.full(n, near.mu))}
-    split = RMPVICES(robot, each)
-    assert split.collision["spheres"] == near
+    split = RMPVICES(robot).with_collision(each)
+    assert split.leaves.collision["spheres"] == near
     for k in range(3):
         q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
         with jax.enable_x64(True):
             out = jax.device_get(
-                split(q, qd, split.setpoint(q, split.decode(action)), obstacles)
+                split(q, qd, split.setpoint(q, split.decode(action), 0.0), obstacles)
             )
         np.testing.assert_allclose(
             out.M, fast.M[k], rtol=0, atol=1e-9 * np.abs(fast.M[k]).max()
@@ -75,8 +76,8 @@ def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):
 
 
 def test_unknown_kind_of_obstacle_is_refused(robot):
-    with pytest.raises(ValueError, match="spheres, planes, capsules, boxes"):
-        RMPVICES(robot, {"sphere": collision_near()})
+    with pytest.raises(ValueError, match=r"spheres, planes, capsules, boxes.*Did you"):
+        RMPVICES(robot).with_collision({"sphere": collision_near()})
 
 
 def _coordinates(node, x, t):
@@ -100,9 +101,11 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
     @quick_jit
     def leaf_terms(ctrl, q, qd, action, obstacles):
         Mq, _ = dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))
-        setpoint = ctrl.setpoint(q, ctrl.decode(action))
-        yielded = ctrl(q, qd, setpoint, obstacles).diagnostics["orientation_weight"]
-        tree = rmp_vices_tree(ctrl, setpoint, obstacles, Mq, yielded)
+        setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
+        weight = ctrl(q, qd, setpoint, obstacles).diagnostics["orientation_weight"]
+        tree = rmp_vices_tree(
+            ctrl.robot, ctrl.leaves, setpoint, obstacles, Mq, 1.0, weight
+        )
 
         def values(q, t):
             return [y for _, y in _coordinates(tree, q, t)]
@@ -152,13 +155,15 @@ def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast)
 
 def test_every_branch_matters(run64, ctrl, inputs, fast):
     """Weakening any leaf changes the torque: none is dead in the comparison above."""
-    for field, change in (
-        ("collision", {"mu": 1e-9}),
-        ("self_collision", {"mu": 1.0}),
-        ("posture", {"kq": 1.0}),
-        ("yielding", {"least": 0.5}),
-        ("limit_yielding", {"least": 0.5}),
+    leaves = ctrl.leaves
+    for name, changed in (
+        ("collision", leaves.collision.replace(mu=1e-9)),
+        ("self_collision", leaves.self_collision.replace(mu=1.0)),
+        ("posture", leaves.posture.replace(kq=1.0)),
     ):
-        leaf = dataclasses.replace(getattr(ctrl, field), **change)
-        out = run64(ctrl.replace(**{field: leaf}), *inputs)
-        assert np.abs(out.M - fast.M).max() + np.abs(out.f - fast.f).max() > 1e-6, field
+        out = run64(ctrl.replace(leaves=leaves.replace(**{name: changed})), *inputs)
+        assert np.abs(out.M - fast.M).max() + np.abs(out.f - fast.f).max() > 1e-6, name
+    for name in ("obstacle_relaxation", "limit_relaxation"):
+        relaxed = getattr(ctrl, name).replace(min_weight=0.5)
+        out = run64(ctrl.replace(**{name: relaxed}), *inputs)
+        assert np.abs(out.M - fast.M).max() + np.abs(out.f - fast.f).max() > 1e-6, name

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rmp_mjx import RMPVICES
+from rmp_mjx import RMPVICES, Leaves
 from tests import oracles
 
 
@@ -72,8 +72,7 @@ def test_tree_without_safety_converges_to_coupled_operational_space_control(
     """
     args, terms, wanted = case
     strong = robot.replace(tau_max=np.full(7, 1e12))
-    safety = ("collision", "self_collision", "joint_limit", "posture")
-    off = dict.fromkeys((*safety, "yielding", "limit_yielding"))
+    off = dict.fromkeys(("obstacle_relaxation", "limit_relaxation"))
     expected, quality = [], []
     for k in range(len(args[0])):
         J, Mq = terms.J[k], terms.Mq[k]
@@ -86,7 +85,7 @@ def test_tree_without_safety_converges_to_coupled_operational_space_control(
 
     medians = []
     for eps in (1e-3, 1e-5, 1e-7):
-        out = run64(RMPVICES(strong, regularizer=eps, **off), *args)
+        out = run64(RMPVICES(strong, Leaves(), regularizer=eps, **off), *args)
         error = np.abs(out.tau - terms.bias - expected).max(1)
         relative = (error / np.abs(expected).max(1))[regular]
         medians.append(np.median(relative))

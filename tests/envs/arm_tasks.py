@@ -19,8 +19,8 @@ class Torques(Pytree):
     def decode(self, action):
         return action
 
-    def setpoint(self, q, action):
-        return Setpoint(jnp.zeros(3), jnp.eye(3), action[:3], action[3:6])
+    def setpoint(self, q, action, time):
+        return Setpoint(jnp.zeros(3), jnp.eye(3), action[:3], action[3:6], time)
 
     def __call__(self, q, qd, setpoint, obstacles):
         push = jnp.concatenate([setpoint.kp_pos, setpoint.kp_ori, jnp.zeros(1)])

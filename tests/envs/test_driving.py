@@ -103,7 +103,7 @@ def test_clearance_of_the_tree_is_mujocos_distance(make, start, arm):
     lane = jax.tree.map(lambda x: x[SPHERE], start)
     q, qd = lane.data.qpos, lane.data.qvel
     obstacles = env.obstacles(lane.data, lane.info["spheres"])
-    setpoint = env.controller.setpoint(q, env.controller.decode(jnp.zeros(12)))
+    setpoint = env.controller.setpoint(q, env.controller.decode(jnp.zeros(12)), 0.0)
     out = jax.jit(env.controller.__call__)(q, qd, setpoint, obstacles)
     model, data = env.scene.model, arm.data
     data.qpos[:], data.mocap_pos[:] = q, lane.data.mocap_pos

@@ -78,18 +78,18 @@ def test_where_the_hand_works_the_tree_keeps_further_off_spheres(task):
     """The default leaf elsewhere, for controllers of one's own, and for the others."""
     env = envs.load(task, physics="mujoco")
     near, leaves = collision_near(), env.collision_leaves(env.robot)
-    assert env.controller.collision["spheres"] == leaves["spheres"]
+    assert env.controller.leaves.collision["spheres"] == leaves["spheres"]
     assert leaves["spheres"].margin > near.margin
-    assert env.controller.collision["planes"] == near
+    assert env.controller.leaves.collision["planes"] == near
     own = RMPVICES(env.robot)
     assert envs.load(task, physics="mujoco", controller=own).controller is own
     literal = envs.load(task, physics="mujoco", controller="rmp_vices_literal")
-    assert isinstance(literal.controller.collision, PaperCollision)
+    assert isinstance(literal.controller.leaves.collision, PaperCollision)
 
 
 def test_the_hand_may_come_nearer_to_the_doors_panel_than_the_other_links():
     env = envs.load("door", physics="mujoco")
-    margin = np.asarray(env.controller.collision["boxes"].margin)
+    margin = np.asarray(env.controller.leaves.collision["boxes"].margin)
     hand = np.array(env.robot.points.segment) == env.robot.n - 1
     assert (margin[hand] == np.float32(0.005)).all()
     assert (margin[~hand] == np.float32(0.015)).all()

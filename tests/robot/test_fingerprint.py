@@ -58,5 +58,5 @@ def test_it_is_the_same_in_another_process(robot):
 
 
 def test_a_robot_prints_on_one_line(robot):
-    expected = "Robot 'jaco2': 7 joints to site 'grip', 59 control points"
+    expected = "Robot('jaco2', 7 joints to site 'grip', 59 control points)"
     assert repr(robot) == expected

@@ -73,7 +73,7 @@ def test_every_controller_gives_the_passive_forces_on_top(sprung, controller):
     torques = []
     for robot in (sprung, bare):
         ctrl = controller(robot)
-        setpoint = ctrl.setpoint(q, action)
+        setpoint = ctrl.setpoint(q, action, 0.0)
         out = jax.jit(ctrl)(q, qd, setpoint, Obstacles.empty())
         assert out.diagnostics["torque_scale"] == 1.0
         torques.append(out.tau)

@@ -3,29 +3,31 @@
 import jax.numpy as jnp
 import numpy as np
 
-from rmp_mjx import Yielding
+from rmp_mjx import OrientationRelaxation
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def test_weight_falls_from_one_to_its_least_as_the_clearance_shrinks():
     """Geometrically; 1e-6: float32."""
-    weight = Yielding(least=0.01, near=0.02, far=0.08)
+    weight = OrientationRelaxation(min_weight=0.01, near=0.02, far=0.08)
     clearance = jnp.asarray([jnp.inf, 1.0, 0.08, 0.05, 0.02, -0.1])
     np.testing.assert_allclose(
         weight(clearance), [1.0, 1.0, 1.0, 0.1, 0.01, 0.01], rtol=1e-6
     )
 
 
-def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obstacles):
+def test_orientation_is_relaxed_beside_bodies_but_not_beside_planes(
+    run64, ctrl, states, obstacles
+):
     """Clearance to spheres, capsules and boxes counts, whatever the floor does."""
     q, qd, action = states(3)
     near = obstacles(3)
     low = near.planes.replace(point=near.planes.point - 5.0 * UP)
     high = near.planes.replace(point=near.planes.point + 0.4 * UP)
     weights = []
-    leaf = Yielding(least=0.01, near=0.02, far=0.08)
-    holding = ctrl.replace(yielding=leaf, limit_yielding=None)
+    leaf = OrientationRelaxation(min_weight=0.01, near=0.02, far=0.08)
+    holding = ctrl.replace(obstacle_relaxation=leaf, limit_relaxation=None)
     for planes in (low, high):
         out = run64(holding, q, qd, action, near.replace(planes=planes))
         weights.append(out.diagnostics["orientation_weight"])
@@ -38,11 +40,14 @@ def test_orientation_yields_to_bodies_but_not_to_planes(run64, ctrl, states, obs
     assert np.mean(weights[0] < 0.5) > 0.05
 
 
-def test_orientation_yields_to_the_nearest_joint_limit(run64, ctrl, states, obstacles):
+def test_orientation_is_relaxed_near_the_nearest_joint_limit(
+    run64, ctrl, states, obstacles
+):
     """1e-9: float64. Joints without a limit do not count."""
     q, qd, action = states(4)
-    leaf = Yielding(least=0.01, near=0.2, far=1.0)  # some of the states are further
-    holding = ctrl.replace(yielding=None, limit_yielding=leaf)
+    # Some of the states are further from their limits.
+    leaf = OrientationRelaxation(min_weight=0.01, near=0.2, far=1.0)
+    holding = ctrl.replace(obstacle_relaxation=None, limit_relaxation=leaf)
     out = run64(holding, q, qd, action, obstacles(4))
     weight = out.diagnostics["orientation_weight"]
     lower, upper = np.asarray(ctrl.robot.q_lower), np.asarray(ctrl.robot.q_upper)

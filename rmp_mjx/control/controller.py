@@ -1,0 +1,84 @@
+"""What a controller is, and what the impedance controllers share."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, ArrayLike, Float
+
+from rmp_mjx.control.action import ActionRange, compose_setpoint
+from rmp_mjx.control.arguments import check, check_action
+from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Pytree
+from rmp_mjx.robot.kinematics import site_pose
+from rmp_mjx.robot.model import Robot
+from rmp_mjx.types import Action, ControlOutput, Setpoint
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """From a policy's action to joint torques, for one state; callers vmap it.
+
+    At every policy step ``setpoint(q, decode(action), time)`` gives the target. The
+    call gives the torque at every control step until the next one. All three are pure
+    functions. What `decode` returns is what `setpoint` takes, and what that returns is
+    what the call takes: they are `Action` and `Setpoint` for the controllers here.
+    """
+
+    def decode(self, action: Float[Array, " 12"]) -> Any:
+        """Physical units of a policy's action in [-1, 1]^12."""
+        ...
+
+    def setpoint(self, q: Float[Array, " n"], action: Any, time: Any) -> Any:
+        """The target from joint positions [rad], action and time of the step [s]."""
+        ...
+
+    def __call__(
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        setpoint: Any,
+        obstacles: Obstacles,
+    ) -> ControlOutput:
+        """Torque for joint positions [rad] and velocities [rad/s]."""
+        ...
+
+
+class ImpedanceController(Pytree):
+    """A controller whose target is a pose and a stiffness of the end effector."""
+
+    robot: Robot
+    """The arm."""
+    action_range: ActionRange = struct.field(default_factory=ActionRange, kw_only=True)
+    """Physical meaning of a policy action in [-1, 1]^12."""
+
+    def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
+        """Physical units of a policy's action in [-1, 1]^12, (12,).
+
+        Raises:
+            ValueError: The action has another shape or no floats.
+        """
+        return self.action_range.decode(action)
+
+    def setpoint(
+        self,
+        q: Float[ArrayLike, " n"],
+        action: Action,
+        time: Float[ArrayLike, ""] | float,
+    ) -> Setpoint:
+        """Impedance target: the current site pose displaced by the action.
+
+        Args:
+            q: Joint positions, (n,) [rad].
+            action: Displacement and stiffness, from `decode`.
+            time: Time of the policy step since the start of the episode [s].
+
+        Raises:
+            ValueError: An argument has another shape or no floats.
+        """
+        check("q", q, (self.robot.n,))
+        check_action(action)
+        p, R = site_pose(self.robot, jnp.asarray(q))
+        return compose_setpoint(p, R, action, time)

@@ -1,0 +1,117 @@
+"""Arguments of a wrong shape or dtype: the message names them."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rmp_mjx import RMPVICES, VICES, Action, Obstacles, Robot
+from rmp_mjx.control.cbf import FilteredVICES
+from tests.robot.test_model import GRIPPER
+
+Q = np.zeros(3, np.float32)
+ACTION = Action(*np.zeros((4, 3), np.float32))
+SLOTS = Obstacles.empty(spheres=2, boxes=1)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot.from_mjcf(GRIPPER, site="tip", spacing=0.1)
+
+
+def call(ctrl, q=Q, qd=Q, obstacles=SLOTS, **fields):
+    """Trace the controller with these arguments and fields of the set-point."""
+    setpoint = ctrl.setpoint(Q, ACTION, 0.0).replace(**fields)
+    return jax.eval_shape(lambda: ctrl(q, qd, setpoint, obstacles))
+
+
+def spheres(**fields):
+    return {"obstacles": SLOTS.replace(spheres=SLOTS.spheres.replace(**fields))}
+
+
+WRONG = {
+    "an integer state": (
+        {"q": np.zeros(3, int)},
+        "q must be a float array of shape (3,), got int64 (3,)",
+    ),
+    "a state of another arm": (
+        {"qd": np.zeros(7, "f")},
+        "qd must be a float array of shape (3,), got float32 (7,)",
+    ),
+    "a batch": (
+        {"q": np.zeros((8, 3), "f")},
+        "q must be a float array of shape (3,), got float32 (8, 3); "
+        "batches go through jax.vmap(ctrl)",
+    ),
+    "a list": (
+        {"q": [0.0, 0.0, 0.0]},
+        "q must be a float array of shape (3,), got list",
+    ),
+    "a quaternion": (
+        {"R_des": np.zeros(4)},
+        "setpoint.R_des must be a float array of shape (3, 3), got float64 (4,)",
+    ),
+    "one stiffness": (
+        {"kp_pos": np.float32(100.0)},
+        "setpoint.kp_pos must be a float array of shape (3,), got float32 ()",
+    ),
+    "times": (
+        {"time": np.zeros(5)},
+        "setpoint.time must be a float array of shape (), got float64 (5,); "
+        "batches go through jax.vmap(ctrl)",
+    ),
+    "one radius": (
+        spheres(radius=np.ones(1)),
+        "obstacles.spheres.radius must be a float array of shape (2,), "
+        "got float64 (1,)",
+    ),
+    "numbers as flags": (
+        spheres(active=np.ones(2)),
+        "obstacles.spheres.active must be a bool array of shape (2,), got float64 (2,)",
+    ),
+    "no obstacles": (
+        {"obstacles": None},
+        "obstacles must be an Obstacles, got NoneType: Obstacles.empty(...) makes one",
+    ),
+}
+
+
+@pytest.mark.parametrize(("wrong", "message"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize("make", [RMPVICES, VICES, FilteredVICES])
+def test_a_wrong_argument_is_named(robot, make, wrong, message):
+    with pytest.raises(ValueError, match=re.escape(message) + r"(\n|$)"):
+        call(make(robot), **wrong)
+
+
+def test_right_arguments_pass_in_any_precision_and_batched_by_vmap(robot):
+    ctrl = VICES(robot)
+    assert call(ctrl, q=Q.astype(np.float64)).tau.shape == (3,)
+    setpoint = ctrl.setpoint(Q, ACTION, 0.0)
+    batched = jax.vmap(ctrl, in_axes=(0, 0, None, None))
+    out = jax.eval_shape(batched, jnp.zeros((8, 3)), jnp.zeros((8, 3)), setpoint, SLOTS)
+    assert out.tau.shape == (8, 3)
+
+
+def test_the_checks_leave_no_trace_in_the_program(robot):
+    """The same operations with and without obstacle slots of no use to VICES."""
+    ctrl = VICES(robot)
+    setpoint = ctrl.setpoint(Q, ACTION, 0.0)
+    empty, full = (
+        str(jax.make_jaxpr(lambda q, o=o: ctrl(q, q, setpoint, o).tau)(Q))
+        for o in (Obstacles.empty(), SLOTS)
+    )
+    assert empty == full
+
+
+def test_an_action_and_a_set_point_are_not_confused(robot):
+    ctrl = VICES(robot)
+    with pytest.raises(ValueError, match=r"action must be an Action, got ndarray"):
+        ctrl.setpoint(Q, np.zeros(12), 0.0)
+    with pytest.raises(ValueError, match=r"action\.drot must be .* got float64 \(4,\)"):
+        ctrl.setpoint(Q, ACTION.replace(drot=np.zeros(4)), 0.0)
+    with pytest.raises(ValueError, match="setpoint must be a Setpoint, got Action"):
+        ctrl(Q, Q, ACTION, SLOTS)
+    with pytest.raises(ValueError, match=r"action must be .* got int64 \(12,\)"):
+        ctrl.decode(np.zeros(12, int))

@@ -1,0 +1,84 @@
+"""The motion of the set-point that frees a hand at rest."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rmp_mjx import RMPVICES, Obstacles, Robot, SetpointDither
+from tests.control.conftest import QUICK
+from tests.robot.test_model import GRIPPER
+
+STILL = jnp.zeros(3)
+
+
+def test_it_grows_as_the_room_shrinks_and_stays_within_its_amplitude():
+    """1e-7 m: float32. No room lost, no dither, whatever the time."""
+    dither = SetpointDither(amplitude=0.03, near=0.02, far=0.05)
+    times = jnp.linspace(0.0, 100.0, 1000)
+    at = jax.vmap(lambda time, room: dither(time, room, STILL), (0, None))
+    for room, share in ((jnp.inf, 0.0), (0.05, 0.0), (0.035, 0.5), (0.0, 1.0)):
+        moved = np.abs(at(times, jnp.asarray(room))).max(0)
+        assert np.all(moved <= 0.03 * share + 1e-7)
+        assert np.all(moved >= 0.029 * share - 1e-7)
+
+
+def test_the_first_axis_goes_round_in_its_period():
+    dither = SetpointDither(period=2.5)
+    whole, half = (dither(t, jnp.zeros(()), STILL) for t in (2.5, 1.25 / 2))
+    np.testing.assert_allclose(whole[0], 0.0, atol=1e-7)
+    np.testing.assert_allclose(half[0], dither.amplitude, rtol=1e-6)
+
+
+def test_a_hand_that_moves_is_left_alone():
+    """At three times `speed`, exp(-9) = 1.2e-4 is left."""
+    dither, room = SetpointDither(), jnp.zeros(())
+    moving = dither(0.6, room, jnp.array([3.0 * dither.speed, 0.0, 0.0]))
+    still = dither(0.6, room, STILL)
+    np.testing.assert_allclose(moving, np.exp(-9.0) * still, rtol=1e-4)
+
+
+def test_at_time_zero_the_set_point_stays_where_it_is(run64, ctrl, states, obstacles):
+    """1e-9: float64."""
+    q, qd, action = states(5)
+    near = obstacles(5)
+    ours, plain = (
+        run64(c, q, qd, action, near).tau for c in (ctrl, ctrl.replace(dither=None))
+    )
+    np.testing.assert_allclose(ours, plain, rtol=1e-9, atol=1e-9)
+
+
+def test_a_plain_loop_dithers_beside_a_body_and_nowhere_else():
+    """Policy steps of 0.1 s with decode, setpoint and call, and nothing else.
+
+    The arm stands still with a sphere 1 cm off its hand, then 20 cm further off.
+    """
+    ctrl = RMPVICES(Robot.from_mjcf(GRIPPER, site="tip", spacing=0.1))
+    ctrl = ctrl.replace(leaves=ctrl.leaves.replace(self_collision=None))
+    q, qd = jnp.array([0.1, 0.5, -0.3]), jnp.zeros(3)
+    policy = jnp.zeros(12)
+
+    def clearance(center):
+        slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
+        setpoint = ctrl.setpoint(q, ctrl.decode(policy), 0.0)
+        return ctrl(q, qd, setpoint, slots).diagnostics["clearance"]
+
+    @jax.jit(compiler_options=QUICK)
+    def loop(away):
+        grip = ctrl.setpoint(q, ctrl.decode(policy), 0.0).p_des
+        center = grip + jnp.array([0.1, 0.0, 0.0])
+        center -= jnp.array([1.0, 0.0, 0.0]) * (clearance(center) - 0.01 - away)
+        slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
+
+        def policy_step(_, k):
+            setpoint = ctrl.setpoint(q, ctrl.decode(policy), 0.1 * k)
+            out = ctrl(q, qd, setpoint, slots)
+            return None, (out.tau, out.diagnostics["clearance"])
+
+        return jax.lax.scan(policy_step, None, jnp.arange(5))[1]
+
+    tau, room = loop(0.0)
+    assert room[0] < 0.04
+    assert np.abs(np.diff(tau, axis=0)).max(1).min() > 1e-3
+    tau, room = loop(0.2)
+    assert room[0] > 0.05
+    np.testing.assert_array_equal(np.diff(tau, axis=0), 0.0)
