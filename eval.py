@@ -11,6 +11,7 @@ from rich.console import Console
 import envs
 from envs import cli
 from rmp_mjx import runtime, sim
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.evaluation import evaluate, film, report
 from rmp_mjx.training.learning import networks
 from rmp_mjx.training.runs import run_folder
@@ -45,9 +46,9 @@ def main(args: Sequence[str] | None = None) -> int:
                 options.seed_index,
                 options.checkpoint,
             )
-        except CheckpointError as error:
+        except (CheckpointError, ConfigError) as error:
             print(f"error: {error}", file=sys.stderr)
-            return 1
+            return 2 if isinstance(error, ConfigError) else 1
     elif options.agent == "zero":
         agent = networks.zero_agent(env.action_size)
     else:

@@ -45,8 +45,6 @@ class Runtime:
     """Value of ``XLA_FLAGS`` that the JAX backend starts with."""
     cache_dir: Path | None
     """Folder of the persistent compilation cache; None where it is off."""
-    gl: str | None
-    """MuJoCo's rendering backend; None if it was not requested or none works here."""
 
 
 def configure(
@@ -55,7 +53,6 @@ def configure(
     split_cpu: bool = False,
     compile_cache: bool = True,
     cache_dir: str | os.PathLike[str] | None = None,
-    rendering: bool = False,
 ) -> Runtime:
     """Prepare this process; call it before the first JAX operation.
 
@@ -72,11 +69,9 @@ def configure(
         cache_dir: Folder of that cache. By default
             ``JAX_COMPILATION_CACHE_DIR``, then ``$XDG_CACHE_HOME/rmp_mjx/xla``,
             then ``~/.cache/rmp_mjx/xla``.
-        rendering: Also choose a headless rendering backend where there is no
-            display.
 
     Returns:
-        The settings in force. ``gl`` is None if rendering cannot work here.
+        The settings in force.
 
     Warns:
         RuntimeWarning: The JAX backend is already running, so XLA flags have no
@@ -98,7 +93,7 @@ def configure(
     if split_cpu:
         _split_cpu(flags)
     folder = _enable_compile_cache(cache_dir) if compile_cache else None
-    return Runtime(flags, folder, choose_gl() if rendering else None)
+    return Runtime(flags, folder)
 
 
 def cpu_xla_flags(jaxlib_version: str | None = None) -> tuple[str, ...]:

@@ -300,7 +300,10 @@ def differing_fields(
         ConfigError: The record is of version 0.1.
     """
     if "ppo" not in saved:
-        raise ConfigError("its configuration is of version 0.1: convert it first")
+        raise ConfigError(
+            "a run of version 0.1 cannot be resumed: evaluate it as it is, or finish "
+            "it with that version"
+        )
     usual = TrainConfig(type(config.task)())
     default, given, new = (
         defining(json.loads(json.dumps(record)))
@@ -314,9 +317,9 @@ def differing_fields(
     }
 
 
-def save_config(config: TrainConfig, path: Path) -> None:
-    """Write a configuration as JSON."""
-    write_text(path, json.dumps(config.record(), indent=2) + "\n")
+def save_config(config: TrainConfig, path: Path, **more: Any) -> None:
+    """Write a configuration as JSON, and what else is to be kept with it."""
+    write_text(path, json.dumps(config.record() | more, indent=2) + "\n")
 
 
 def config_of(

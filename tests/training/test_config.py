@@ -148,7 +148,7 @@ def test_a_configuration_of_version_0_1_is_read(tmp_path):
     )
 
 
-def test_a_run_of_version_0_1_is_resumed_only_once_it_is_converted(tmp_path):
+def test_a_run_of_version_0_1_is_not_resumed(tmp_path):
     (tmp_path / "config.json").write_text(OLD.read_text())
     config = parsed("--resume", tmp_path)
     assert config == load_config(tmp_path).replace(resume=str(tmp_path))

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from rmp_mjx.training.runs import distributed, run_folder
+from rmp_mjx.training.runs import distributed, identity, run_folder
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs.checkpoint import NEWEST, Checkpointer
 from rmp_mjx.training.config import TrainConfig
@@ -64,15 +64,18 @@ def train(
 
     Raises:
         CheckpointError: The run to continue has no usable checkpoint.
+        ConfigError: It was trained in another environment.
         TrainingFailure: The simulation or the learner became non-finite, or nothing
             can be saved.
     """
     console = console or Console()
     commands = commands or Commands()
+    if config.run.resume:
+        identity.check(identity.saved(folder / run_folder.CONFIG), env, folder)
     programs = seeds.programs(env, config.ppo, config.run.num_devices)
     checkpoints = _open_checkpoints(config, folder)
     state, first = _start(programs, config, checkpoints, console)
-    _announce(config, folder, programs.mesh.size, console)
+    _announce(env, config, folder, programs.mesh.size, console)
     primary = distributed.is_primary()
     logger = _open_logger(config, folder, first, console) if primary else None
     note = logger.note if logger else console.print
@@ -194,9 +197,11 @@ def _open_logger(
     return RunLogger(path, config.num_iterations, done, console, trackers)
 
 
-def _announce(config: TrainConfig, folder: Path, devices: int, console: Console):
+def _announce(
+    env: Env, config: TrainConfig, folder: Path, devices: int, console: Console
+):
     """Write what the run uses into its folder, and print its devices."""
-    changes = run_folder.describe(folder, config) if distributed.is_primary() else []
+    changes = run_folder.describe(folder, config, env) if distributed.is_primary() else []
     console.print(f"training on {run_folder.device(devices)}", highlight=False)
     if changes:
         console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)
@@ -249,7 +254,9 @@ def load_agent(
 
     Raises:
         CheckpointError: There is no usable checkpoint.
+        ConfigError: The run was trained in another environment.
     """
+    identity.check(identity.saved(folder / run_folder.CONFIG), env, folder)
     ppo = make_ppo(env, config.ppo)
     whole = seeds.shapes(ppo, config.ppo)
     learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)

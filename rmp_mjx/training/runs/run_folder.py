@@ -1,6 +1,5 @@
 """The folder of a run: what it contains, and who may write into it."""
 
-import fcntl
 import json
 import os
 import platform
@@ -10,12 +9,17 @@ import sys
 import time
 from importlib import metadata
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import jax
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 from rmp_mjx.files import write_text
-from rmp_mjx.training.runs import trackers
+from rmp_mjx.training.runs import identity, trackers
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
@@ -138,6 +142,11 @@ def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
 
 def _lock(folder: Path) -> IO[str]:
     """Take the folder's lock; the system releases it when the process ends."""
+    if fcntl is None:
+        raise ConfigError(
+            "training needs Linux or macOS: it locks a run's folder with flock, which "
+            f"{platform.system()} does not have"
+        )
     lock = (folder / LOCK).open("a+")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -152,8 +161,8 @@ def _lock(folder: Path) -> IO[str]:
     return lock
 
 
-def describe(folder: Path, config: TrainConfig) -> list[str]:
-    """Write the configuration and the versions that a run uses.
+def describe(folder: Path, config: TrainConfig, env: Any) -> list[str]:
+    """Write the configuration, the environment's identity and the versions of a run.
 
     A resumed run adds its versions to those that it was started with.
 
@@ -161,7 +170,7 @@ def describe(folder: Path, config: TrainConfig) -> list[str]:
         What has changed since the run was last continued: a resumed run is
         bit-identical to an uninterrupted one only where this is empty.
     """
-    save_config(config, folder / CONFIG)
+    save_config(config, folder / CONFIG, **{identity.KEY: identity.of(env)})
     history, now = _history(folder), versions()
     write_text(folder / VERSIONS, json.dumps([*history, now], indent=2) + "\n")
     return changes_since(history, now)
