@@ -33,6 +33,7 @@ LAW = {
     "control": BASE | {"rmp", "shapes", "obstacles", "robot"},
     "sim": BASE | {"obstacles", "robot", "runtime"},
     "training": GROUND | {"types", "runtime", "files"},
+    "report": {"files", "training"},
     "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
 }
 # The rooms inside `training`, each with those that it may import.

@@ -1,14 +1,19 @@
 """The page that compares runs."""
 
 import base64
+import dataclasses
 import json
 import re
+from pathlib import Path
 
 import polars as pl
 import pytest
 
-from benchmarks import report
 from envs.cli import make_config
+from rmp_mjx.report.__main__ import main
+from rmp_mjx.report.charts import split_curves
+from rmp_mjx.report.page import page, table
+from rmp_mjx.report.runs import grouped, read_config, read_run
 from rmp_mjx.training.config import save_config
 from rmp_mjx.training.runs import run_folder
 
@@ -53,7 +58,7 @@ def runs(tmp_path_factory):
 
 
 def test_runs_that_differ_in_their_seed_alone_form_a_group(runs):
-    found = report.grouped(run for folder in runs for run in report.read_run(folder))
+    found = grouped(run for folder in runs for run in read_run(folder))
     assert [(g.name, len(g.runs)) for g in found] == [
         ("controller vices", 2),
         ("controller rmp_vices", 2),
@@ -63,8 +68,8 @@ def test_runs_that_differ_in_their_seed_alone_form_a_group(runs):
 
 
 def test_the_table_has_means_over_seeds_and_events_of_all_of_training(runs):
-    found = report.grouped(run for folder in runs for run in report.read_run(folder))
-    head, first, _ = report.table(found)
+    found = grouped(run for folder in runs for run in read_run(folder))
+    head, first, _ = table(found)
     line = dict(zip(head, first, strict=True))
     assert line["seeds"] == "2" and line["policy steps"] == "3,000"
     assert line["events in training"] == "12"  # two per thousand steps, two seeds
@@ -75,32 +80,48 @@ def test_the_table_has_means_over_seeds_and_events_of_all_of_training(runs):
 
 def test_the_page_needs_no_other_file_and_says_what_differs(runs, tmp_path, capsys):
     out = tmp_path / "new" / "page.html"
-    assert report.main([*map(str, runs), "--out", str(out)]) == 0
+    assert main([*map(str, runs), "--out", str(out)]) == 0
     assert "2 groups, 4 runs" in capsys.readouterr().out
-    page = out.read_text()
-    sources = re.findall(r'src="([^"]*)"', page)
+    written = out.read_text()
+    sources = re.findall(r'src="([^"]*)"', written)
     assert len(sources) == 2
     for source in sources:
         kind, _, code = source.partition(",")
         assert kind == "data:image/svg+xml;base64"
         assert b"<svg" in base64.b64decode(code)
-    assert "href=" not in page and "<script" not in page
-    assert "a &lt;script&gt;" in page
-    differing = page.split("What differs")[1].split("Runs</h2>")[0]
+    assert "href=" not in written and "<script" not in written
+    assert "a &lt;script&gt;" in written
+    differing = written.split("What differs")[1].split("Runs</h2>")[0]
     assert "<td>controller</td><td>vices</td><td>rmp_vices</td>" in differing
     assert "num_envs" not in differing
 
 
 def test_curves_that_never_move_are_named_and_not_drawn(runs):
-    found = report.grouped(run for folder in runs for run in report.read_run(folder))
-    moving, flat = report.split_curves(found)
+    found = grouped(run for folder in runs for run in read_run(folder))
+    moving, flat = split_curves(found)
     assert moving == ["episode/return"]
     assert flat == ["episode/success", "per_1000_steps/collision"]
 
 
 def test_a_folder_that_is_no_run_is_refused(runs, tmp_path, capsys):
-    assert report.main([str(tmp_path)]) == 2
+    assert main([str(tmp_path)]) == 2
     assert "no run folder" in capsys.readouterr().err
     save_config(make_config(), tmp_path / run_folder.CONFIG)
-    assert report.main([str(tmp_path)]) == 2
+    assert main([str(tmp_path)]) == 2
     assert "no rows yet" in capsys.readouterr().err
+
+
+def test_a_run_of_the_last_version_is_read(tmp_path):
+    old = Path(__file__).parent / "training" / "config-0.1.json"
+    (tmp_path / run_folder.CONFIG).write_text(old.read_text())
+    flat, found = json.loads(old.read_text()), read_config(tmp_path)
+    assert found.ppo.num_envs == flat["num_envs"]
+    assert found.run.num_timesteps == flat["num_timesteps"]
+    assert found.task.title == f"{flat['env']}, {flat['controller']}"
+
+
+def test_what_only_names_a_run_is_escaped(runs):
+    groups = grouped(run for folder in runs for run in read_run(folder))
+    odd = [dataclasses.replace(groups[0], name="<b>$x_1$</b>"), groups[1]]
+    found = page(odd)
+    assert "&lt;b&gt;$x_1$&lt;/b&gt;" in found and "<b>$" not in found
