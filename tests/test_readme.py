@@ -90,6 +90,9 @@ def test_the_commands_of_the_documents_exist(document, command):
         else:
             assert (ROOT / words[1]).exists(), f"no script {words[1]}"
             target, rest = (words[1],), words[2:]
+            if "--env" in rest:  # its options are flags
+                at = rest.index("--env")
+                target += tuple(rest[at : at + 2])
         # Underscores and dashes are both accepted in option names.
         shown = help_text(*target).replace("_", "-")
         for flag in (w.split("=")[0] for w in rest if w.startswith("--")):
