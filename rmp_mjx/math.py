@@ -65,6 +65,46 @@ def psd_solve(
     return jnp.stack([x[i] * scale[i] for i in range(n)])
 
 
+def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    r"""Lower factor $L$ of a small positive definite $A = L L^T$, unrolled.
+
+    It calls no LAPACK: a batch vectorises under `jax.vmap`. jaxlib 0.10's batched LAPACK
+    calls wait for the thread pool that runs them, and can wait for ever where several CPU
+    devices do so at once.
+
+    Args:
+        A: Symmetric positive definite matrix, (n, n). Only the lower triangle is read.
+    """
+    n = A.shape[-1]
+    ell = [[jnp.zeros((), A.dtype)] * n for _ in range(n)]
+    for j in range(n):
+        for i in range(j, n):
+            rest = A[i, j]
+            for k in range(j):
+                rest = rest - ell[i][k] * ell[j][k]
+            ell[i][j] = jnp.sqrt(rest) if i == j else rest / ell[j][j]
+    return jnp.stack([jnp.stack(row) for row in ell])
+
+
+def solve_lower(
+    L: Float[Array, "n n"], b: Float[Array, n *k], transposed: bool = False
+) -> Float[Array, n *k]:
+    """Solve ``L x = b``, or ``L^T x = b``, for a small lower triangular L, unrolled.
+
+    Args:
+        L: Lower triangular matrix, (n, n).
+        b: Right-hand side, (n,) or (n, k).
+        transposed: Whether to solve with the transposed matrix.
+    """
+    n = L.shape[-1]
+    x: list[Array] = list(b)
+    for i in reversed(range(n)) if transposed else range(n):
+        for k in range(i + 1, n) if transposed else range(i):
+            x[i] = x[i] - (L[k, i] if transposed else L[i, k]) * x[k]
+        x[i] = x[i] / L[i, i]
+    return jnp.stack(x)
+
+
 def safe_norm(x: Float[Array, "*b n"], eps: float = 1e-12) -> Float[Array, "*b"]:
     """Euclidean norm over the last axis, with a zero gradient at zero.
 

@@ -243,3 +243,19 @@ def test_psd_solve_differentiates_like_the_linear_solve():
 def test_psd_solve_names_the_shapes_that_do_not_match():
     with pytest.raises(ValueError, match=r"\(3, 3\), \(2,\)"):
         rmath.psd_solve(jnp.eye(3), jnp.ones(2))
+
+
+def test_cholesky_and_triangular_solves_agree_with_numpy_in_float64():
+    # 1e-10: float64 rounding times a condition of about 1e4.
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(20, 7, 7))
+    A = root @ root.swapaxes(1, 2) + 0.1 * np.eye(7)
+    b, wide = rng.normal(size=(20, 7)), rng.normal(size=(20, 7, 5))
+    with jax.enable_x64(True):
+        L = jax.jit(jax.vmap(rmath.cholesky))(A)
+        np.testing.assert_allclose(L, np.linalg.cholesky(A), atol=1e-10)
+        x = jax.jit(jax.vmap(rmath.solve_lower))(L, b)
+        np.testing.assert_allclose(np.einsum("bij,bj->bi", L, x), b, atol=1e-10)
+        solve = jax.vmap(lambda L, b: rmath.solve_lower(L, b, transposed=True))
+        y = jax.jit(solve)(L, wide)
+        np.testing.assert_allclose(L.swapaxes(1, 2) @ y, wide, atol=1e-10)

@@ -7,14 +7,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from rmp_mjx.control.avoidance import self_gaps
 from rmp_mjx.control.projection import project
 from rmp_mjx.control.torque import clip_torque
 from rmp_mjx.control.vices import VICES
-from rmp_mjx.math import psd_solve
+from rmp_mjx.math import cholesky, psd_solve, solve_lower
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
 from rmp_mjx.robot.dynamics import dynamics
@@ -146,8 +145,8 @@ class FilteredVICES(VICES):
         G = jnp.concatenate([-barriers.rows, Mq, -Mq])
         h = jnp.concatenate([need, tau_max - bias, tau_max + bias]) - G @ wanted
         limits = jnp.ones(2 * self.robot.n, bool)
-        L = jnp.linalg.cholesky(Mq)
-        G = solve_triangular(L, G.T, lower=True)
+        L = cholesky(Mq)
+        G = solve_lower(L, G.T)
         length = jnp.sqrt(jnp.sum(G * G, axis=0))
         active = jnp.concatenate([barriers.active, limits]) & (length > FREE)
         scale = jnp.where(active, 1.0 / jnp.where(active, length, 1.0), 0.0)
@@ -157,7 +156,7 @@ class FilteredVICES(VICES):
         change, solved = project(G[:, kept], h[kept], self.penalty)
         left_out = h > h[kept[-1]]
         solved *= ~jnp.any(left_out & (change @ G > h))
-        return wanted + solve_triangular(L.T, change, lower=False), solved
+        return wanted + solve_lower(L, change, transposed=True), solved
 
 
 def _beyond(barriers: Barriers, margin: Array | float) -> Barriers:

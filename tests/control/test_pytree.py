@@ -254,3 +254,18 @@ def test_a_controller_is_printed_in_a_few_lines(small):
     shown = []
     traced(small)
     assert "regularizer=float32[]" in shown[0]
+
+
+@pytest.mark.parametrize("kind", [RMPVICES, VICES, OSC, FilteredVICES])
+def test_a_batch_of_controllers_calls_no_lapack(small, near, kind):
+    """Batched LAPACK calls can wait for ever where several CPU devices make them."""
+    ctrl = kind(small.robot)
+    setpoint = jax.eval_shape(
+        lambda q: ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0), jnp.zeros(3)
+    )
+    q, batch = (
+        jax.ShapeDtypeStruct((4, 3), jnp.float32),
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct((4, *x.shape), x.dtype), setpoint),
+    )
+    program = jax.jit(jax.vmap(ctrl, in_axes=(0, 0, 0, None)))
+    assert "lapack" not in program.lower(q, q, batch, near).as_text()
