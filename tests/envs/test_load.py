@@ -1,13 +1,18 @@
 """Names and options that do not exist are refused before anything compiles."""
 
+from typing import get_args, get_type_hints
+
 import numpy as np
 import pytest
 
 import envs
+from envs.door import VARIANTS, DoorOptions
 from envs.options import substeps
+from envs.placement import LAYOUTS
 from envs.types import METRICS
-from rmp_mjx import RMPVICES
+from rmp_mjx import RMPVICES, sim
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near
+from rmp_mjx.robot import Robot
 
 
 def test_an_unknown_task_lists_the_tasks_and_suggests_one():
@@ -37,6 +42,23 @@ def test_an_unknown_task_lists_the_tasks_and_suggests_one():
 def test_a_wrong_option_is_refused_with_the_valid_ones(options, message):
     with pytest.raises(ValueError, match=message):
         envs.load("trajectory", **options)
+
+
+def test_the_names_that_options_take_are_the_names_that_exist():
+    kind = get_type_hints(envs.options.Options)
+    assert get_args(kind["controller"]) == tuple(envs.options.CONTROLLERS)
+    assert get_args(kind["physics"]) == sim.NAMES
+    assert get_args(kind["layout"]) == tuple(LAYOUTS)
+    assert get_args(get_type_hints(DoorOptions)["variant"]) == tuple(VARIANTS)
+    for name in get_args(kind["armature"]):
+        Robot.load("jaco2", armature=name)
+
+
+def test_options_are_the_same_by_name_and_made_by_hand():
+    made = envs.make_options("door", variant="heavy", obstacles=2)
+    assert made == DoorOptions(variant="heavy", obstacles=2)
+    assert made.record() | {"env": "door"} == made.record()
+    assert envs.make_options(**made.record()) == made
 
 
 @pytest.mark.parametrize("sim_dt", [0.001, 0.002, 0.0025, 0.005, 0.01, 0.05])
