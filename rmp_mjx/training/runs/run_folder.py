@@ -36,6 +36,7 @@ TENSORBOARD = "tensorboard"
 NONFINITE = "nonfinite"
 TRACKED = ("wandb_run", "mlflow_run", "wandb")
 CURVE = "learning_curve.png"
+DETAILS = "training_details.png"
 SEEDS = "seeds"
 SEED_CURVES = f"{SEEDS}/curves.parquet"
 EVALUATION = "eval.json"
@@ -66,6 +67,7 @@ RESULTS = (
     NONFINITE,
     *TRACKED,
     CURVE,
+    DETAILS,
     SEEDS,
     EVALUATION,
     EPISODES,
