@@ -70,9 +70,9 @@ def main(args: Sequence[str] | None = None) -> int:
         "seed": options.seed,
     }
     title = f"{options.agent} agent, {options.task.title}, {options.task.spheres}"
-    columns = report.save(results, env.metric_reductions, about, options.folder, title)
+    columns = report.save(results, env.metrics, about, options.folder, title)
     title += f", {options.episodes} episodes"
-    console.print(report.table(columns, title, env.task_metrics))
+    console.print(report.table(columns, title, env.metrics))
     if options.video:
         from envs.render import render  # loads graphics libraries
 

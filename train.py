@@ -9,10 +9,15 @@ import polars as pl
 from rich.console import Console
 
 import envs
-from envs import cli, grid
+from envs import baselines, cli, grid
 from rmp_mjx import runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
-from rmp_mjx.training.evaluation import evaluate, figures, film, report
+from rmp_mjx.training.evaluation import curves, evaluate, film, report
+from rmp_mjx.training.evaluation.learning_curve import (
+    Baseline,
+    plot_details,
+    plot_learning_curve,
+)
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs import distributed, metrics, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
@@ -27,23 +32,27 @@ def finish(env, agent, config: TrainConfig, folder, console: Console) -> None:
     """Evaluate, plot and film the policy of every seed; the primary process writes."""
     primary = distributed.is_primary()
     if primary:
-        plot(config, folder)
+        plot(env, config, folder)
     if config.run.eval_episodes:
         evaluate_seeds(env, agent, config, folder, console, primary)
     console.print(f"results: {folder}", markup=False, highlight=False)
 
 
-def plot(config: TrainConfig, folder) -> None:
-    """The learning curve, with several seeds that of all together too."""
-    path, over_seeds = folder / run_folder.METRICS, None
+def plot(env, config: TrainConfig, folder) -> None:
+    """The learning curve, and the page of everything else that was recorded."""
+    rows = pl.read_parquet(folder / run_folder.METRICS)
     if config.ppo.num_seeds > 1:
-        rows = pl.read_parquet(path)
-        over_seeds = metrics.over_seeds(rows, figures.curves(rows))
         (folder / run_folder.SEEDS).mkdir(exist_ok=True)
-        over_seeds.write_parquet(folder / run_folder.SEED_CURVES)
-    figures.plot_learning_curve(
-        path, folder / run_folder.CURVE, config.title, over_seeds
-    )
+        together = metrics.over_seeds(rows, curves.columns(rows))
+        together.write_parquet(folder / run_folder.SEED_CURVES)
+    found = baselines.rows(config.task)
+    baseline = None
+    if found is not None:
+        label = f"VICES, {found['seed'].n_unique()} seeds, default task"
+        baseline = Baseline(label, found)
+    picture = folder / run_folder.CURVE
+    plot_learning_curve(rows, env.metrics, picture, config.title, baseline)
+    plot_details(rows, env.metrics, folder / run_folder.DETAILS, config.title)
 
 
 def evaluate_seeds(
@@ -60,15 +69,13 @@ def evaluate_seeds(
         tapes.append(tape)
         if primary:
             found = {env.engine: results}
-            columns.append(
-                report.save(found, env.metric_reductions, about, place, config.title)
-            )
+            columns.append(report.save(found, env.metrics, about, place, config.title))
     if not primary:
         return
     shown = columns[0]
     if config.ppo.num_seeds > 1:
         shown = report.save_over_seeds(columns, about, folder)
-    console.print(report.table(shown, config.title, env.task_metrics))
+    console.print(report.table(shown, config.title, env.metrics))
     if config.run.video:
         from envs.render import render  # loads graphics libraries
 

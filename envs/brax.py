@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
 
 from brax.envs.base import Env
 from brax.envs.base import State as BraxState
 from jaxtyping import Array, Float
 
 from envs.base import ArmEnv
-from envs.types import State
 
 
 class BraxTask(Env):
-    """All of a task's state takes the place of the physics' state.
+    """The whole state of a task is Brax's `pipeline_state`.
 
-    Brax's automatic reset brings back `pipeline_state` and `obs` alone, so what the
-    task carries along must be in there; `info` is left to the wrappers, which also add
-    to the metrics. Keys are raw (`jax.random.PRNGKey`), as Brax's wrappers want them.
+    Brax's automatic reset restores `pipeline_state` and `obs` only. What a task keeps
+    in `info` must be restored too, so it travels in there. Keys are raw
+    (`jax.random.PRNGKey`), as Brax's wrappers want them.
     """
 
     def __init__(self, task: ArmEnv):
@@ -41,20 +40,24 @@ class BraxTask(Env):
 
     def reset(self, rng: Array) -> BraxState:
         """Start an episode."""
-        return _state(self.task.reset(rng), {}, {})
+        start = self.task.reset(rng)
+        return BraxState(
+            pipeline_state=start,  # pyright: ignore[reportArgumentType]
+            obs=start.obs,
+            reward=start.reward,
+            done=start.done,
+            metrics=start.metrics,
+            info={},
+        )
 
     def step(self, state: BraxState, action: Float[Array, " 12"]) -> BraxState:
         """One policy step."""
         new = self.task.step(state.pipeline_state, action)  # pyright: ignore[reportArgumentType]
-        return _state(new, state.metrics, state.info)
-
-
-def _state(state: State, metrics: dict[str, Array], info: dict[str, Any]) -> BraxState:
-    return BraxState(
-        pipeline_state=state,  # pyright: ignore[reportArgumentType]
-        obs=state.obs,
-        reward=state.reward,
-        done=state.done,
-        metrics=metrics | state.metrics,
-        info=info,
-    )
+        return dataclasses.replace(
+            state,
+            pipeline_state=new,
+            obs=new.obs,
+            reward=new.reward,
+            done=new.done,
+            metrics=state.metrics | new.metrics,
+        )

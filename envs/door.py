@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -15,8 +15,10 @@ from envs.base import ArmEnv
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, Contacts
 from envs.types import Entry, Score
-from rmp_mjx.control import per_link
+from envs.views import View
+from rmp_mjx.control import Controller, per_link
 from rmp_mjx.math import quat_to_mat
+from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import ScalarLeaf
 from rmp_mjx.rmp.leaves import collision_near
@@ -68,7 +70,7 @@ class DoorOptions(options.Options):
     handle, which leaves it 10 mm of play."""
 
 
-class Door(ArmEnv):
+class Door(ArmEnv[DoorOptions]):
     """Open the door to 1.04 rad and hold it there.
 
     With the hinge's angle a and rate w, a step pays 500 at rest near the goal
@@ -82,19 +84,23 @@ class Door(ArmEnv):
     Options = DoorOptions
     q_start = np.array([3.363, 4.028, 0.013, 1.847, -0.012, 4.102, 3.178])
     sphere_box = (np.array([0.20, -0.40, 0.0]), np.array([0.60, 0.40, 0.35]))
-    task_metrics: ClassVar[dict[str, str]] = {"door_angle": "max"}
+    task_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("door_angle", "max", unit="rad", headline="angle", table=("mean",)),
+    )
+    view = View((0.4, 0.02, 0.14), 1.45, -65.0, -26.0)
+    """From the other side: the panel would hide the hand."""
     fixture_slots: ClassVar[dict[str, int]] = {"boxes": 2}
     hold = 10
     """Policy steps at rest near the goal that solve the task."""
 
     def __init__(
         self,
-        asked: options.Options,
+        options: DoorOptions,
         robot: Robot | None = None,
-        controller: Any = None,
+        controller: Controller | None = None,
     ):
         """Read the door's geometry from the compiled scene."""
-        super().__init__(asked, robot, controller)
+        super().__init__(options, robot, controller)
         model = self.scene.model
         self.hinge = model.body("door/door").pos
         panel = model.geom("door/panel")
@@ -187,7 +193,7 @@ class Door(ArmEnv):
         across, height = jnp.linalg.norm(off[:2]), jnp.abs(off[2])
         near = 0.5 * (1.0 - jnp.tanh(3.0 * jnp.linalg.norm(off)))
         reward += jnp.where((across < 0.01) & (height < 0.02), 1.0, near)
-        force = record.force + record.work_force
+        force = record.contact_force + record.work_force
         reward -= jnp.where(force > 100.0, 0.05 * force, 0.0)
         held = jnp.where(resting, task["held"] + 1, 0)
         task = {"held": held, "grip_force": record.work_force}

@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import gymnasium  # pyright: ignore[reportMissingImports]
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces  # pyright: ignore[reportMissingImports]
-from gymnasium.utils import seeding  # pyright: ignore[reportMissingImports]
-from gymnasium.vector import (  # pyright: ignore[reportMissingImports]
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import (
     AutoresetMode,
     VectorEnv,
 )
-from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
+from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Int, Key
 
 from envs.base import ArmEnv

@@ -16,8 +16,10 @@ from envs.base import ArmEnv
 from envs.placement import CANDIDATES
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
-from envs.types import Entry, Score
+from envs.types import Entry, Score, State
+from envs.views import GOAL, Mark
 from rmp_mjx.math import quat_to_mat
+from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import ScalarLeaf
 from rmp_mjx.rmp.leaves import collision_near
@@ -71,7 +73,7 @@ class PushOptions(options.Options):
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
-class Push(ArmEnv):
+class Push(ArmEnv[PushOptions]):
     """Push the block to within 5 cm of the goal, and keep it there.
 
     Reward in every step, with the distances h of the grip to its place behind the block
@@ -83,7 +85,9 @@ class Push(ArmEnv):
     Options = PushOptions
     q_start = np.array([3.152, 3.878, -0.009, 1.317, 0.065, 3.708, 3.147])
     sphere_box = (np.array([0.32, -0.28, -0.05]), np.array([0.60, 0.28, 0.20]))
-    task_metrics: ClassVar[dict[str, str]] = {"goal_distance": "last"}
+    task_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("goal_distance", "last", unit="m", headline="goal", table=("mean",)),
+    )
     fixture_slots: ClassVar[dict[str, int]] = {"boxes": 1}
     hand_reward, goal_reward = 5.0, 50.0
     slope = 20.0
@@ -111,13 +115,13 @@ class Push(ArmEnv):
         """Stand the block on the table."""
         asset = mujoco.MjSpec.from_file(str(ASSETS / "push.xml"))
         asset.option.timestep = spec.option.timestep
-        asked = self.options
-        asset.geom("block").mass = asked.block_mass
+        asset.geom("block").mass = self.options.block_mass
         spec.attach(asset, prefix="push/", frame=spec.worldbody.add_frame())
+        friction = self.options.block_friction
         return Contacts(
             work=("push/block",),
-            work_friction=asked.block_friction,
-            passive=(("push/block", "table", asked.block_friction),),
+            work_friction=friction,
+            passive=(("push/block", "table", friction),),
         )
 
     def fixtures(self, slots: Obstacles, data: PhysicsState) -> Obstacles:
@@ -203,3 +207,8 @@ class Push(ArmEnv):
             "block_to_goal": goal - block,
             "hand_to_place": self.place(block, goal) - site.p,
         }
+
+    def marks(self, state: State) -> list[Mark]:
+        """A disc at the goal, as large as the block's reach."""
+        x, y, _ = np.asarray(state.task["goal"], float)
+        return [Mark("disc", np.array([x, y, TABLE_HEIGHT]), self.reach, GOAL)]

@@ -1,11 +1,17 @@
-"""The safety record: contacts, forces and joint limits, step by step."""
+"""The safety record: contacts, forces and joint limits of every step."""
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any, Literal
+
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from envs.scene import Scene
+from envs.smoothness import Motion, Torques
+from rmp_mjx.metric import Metric, of_fields
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim import PhysicsState, read_contacts
@@ -16,73 +22,96 @@ LIMIT_MARGIN = 0.1
 TURN = 2 * jnp.pi
 """robosuite's limit for the continuous joints [rad]."""
 
-REVERSAL = 1.0
-"""A torque that turns round by more than this both ways counts as a reversal [N m]."""
+Fold = Literal["any", "mean", "max"]
+"""How the physics steps of a policy step become one value."""
 
-EVENTS = (
-    "collision",
-    "arm_collision",
-    "obstacle_collision",
-    "self_collision",
-    "joint_limit",
-    "turn_limit",
-)
-"""Flags of a record that are counted when they begin."""
 
-NUMBERS = (
-    "force",
-    "force_peak",
-    "work_force",
-    "work_force_peak",
-    "saturation",
-    "torque_jump",
-    "reversals",
-    "jerk",
-)
-"""Its numbers."""
+def recorded(fold: Fold, metric: Metric) -> Any:
+    """A field of `SafetyRecord`: how it folds, and the metric that it is."""
+    return struct.field(metadata={"fold": fold, "metric": metric})
+
+
+def _event(name: str, label: str = "", headline: str = "", shown: bool = False) -> Any:
+    """A flag that is counted when it begins, and may be in an evaluation's table."""
+    table = ("rate",) if shown else ()
+    metric = Metric(name, "sum", label, event=True, headline=headline, table=table)
+    return recorded("any", metric)
 
 
 class SafetyRecord(Pytree):
-    """What happened during one policy step (or one physics step)."""
+    """What happened during one physics step, or during one policy step.
 
-    collision: Bool[Array, ""]
+    Each field declares its metric and how the physics steps of a policy step fold. A
+    flag whose metric is an event counts when it begins: one that is still set at the
+    next step counts once.
+    """
+
+    collision: Bool[Array, ""] = _event("collision", headline="coll", shown=True)
     """A link or the hand touched what it must not: table, fixture, obstacle, or, for a
-    link, the object the hand works with."""
-    arm_collision: Bool[Array, ""]
+    link, the object that the hand may touch."""
+    arm_collision: Bool[Array, ""] = _event("arm_collision")
     """The same without the hand."""
-    obstacle_collision: Bool[Array, ""]
+    obstacle_collision: Bool[Array, ""] = _event("obstacle_collision")
     """A link or the hand touched a sphere."""
-    self_collision: Bool[Array, ""]
+    self_collision: Bool[Array, ""] = _event(
+        "self_collision", "self-collision", shown=True
+    )
     """Two links touched."""
-    joint_limit: Bool[Array, ""]
+    joint_limit: Bool[Array, ""] = _event("joint_limit", headline="limit", shown=True)
     """A limited joint within 0.1 rad of its range's end."""
-    turn_limit: Bool[Array, ""]
+    turn_limit: Bool[Array, ""] = _event("turn_limit")
     """A continuous joint within 0.1 rad of +-2 pi."""
-    force: Float[Array, ""]
-    """Sum of the normal forces of collisions [N], mean over the physics steps."""
-    force_peak: Float[Array, ""]
-    """Greatest of them on one geom pair [N]."""
-    work_force: Float[Array, ""]
-    """Sum of the normal forces between hand and object [N], mean."""
-    work_force_peak: Float[Array, ""]
+    contact_force: Float[Array, ""] = recorded(
+        "mean", Metric("contact_force", "mean", unit="N")
+    )
+    """Sum of the normal forces of collisions [N]."""
+    contact_force_peak: Float[Array, ""] = recorded(
+        "max",
+        Metric("contact_force_peak", "max", "contact peak", "N", table=("max",)),
+    )
+    """Greatest of them on one pair of geoms [N]."""
+    work_force: Float[Array, ""] = recorded(
+        "mean", Metric("work_force", "mean", unit="N", table=("mean",))
+    )
+    """Sum of the normal forces between the hand and the object it may touch [N]."""
+    work_force_peak: Float[Array, ""] = recorded(
+        "max", Metric("work_force_peak", "max", "work peak", "N")
+    )
     """Greatest such sum [N]."""
-    saturation: Float[Array, ""]
+    torque_saturation: Float[Array, ""] = recorded(
+        "mean",
+        Metric("torque_saturation", "mean", "saturation", "share", table=("mean",)),
+    )
     """Share of the physics steps with a torque at its limit."""
-    torque_jump: Float[Array, ""]
-    """Largest change of a torque from one physics step to the next [N m]."""
-    reversals: Float[Array, ""]
-    """Share of the physics steps in which a torque turns round."""
-    jerk: Float[Array, ""]
-    """Largest jerk of a joint from one physics step to the next [rad/s^3]."""
-    overflow: Bool[Array, ""]
-    """A geom pair had more contacts than were read."""
+    torque_jump: Float[Array, ""] = recorded(
+        "max", Metric("torque_jump", "max", unit="N m")
+    )
+    """Greatest change of a torque from one physics step to the next [N m]."""
+    torque_reversals: Float[Array, ""] = recorded(
+        "mean", Metric("torque_reversals", "mean", unit="share")
+    )
+    """Share of the physics steps in which a torque reverses, as in an oscillation."""
+    joint_jerk: Float[Array, ""] = recorded(
+        "max", Metric("joint_jerk", "max", unit="rad/s^3")
+    )
+    """Greatest jerk of a joint from one physics step to the next [rad/s^3]."""
+    contact_overflow: Bool[Array, ""] = recorded(
+        "any",
+        Metric(
+            "contact_overflow",
+            "max",
+            fault="a pair of bodies had more contacts than are read: forces too low",
+        ),
+    )
+    """A pair of geoms had more contacts than were read."""
 
     @staticmethod
-    def none() -> SafetyRecord:
-        """The record of no time at all."""
+    def empty() -> SafetyRecord:
+        """The record of no steps."""
         no, zero = jnp.zeros((), bool), jnp.zeros(())
-        numbers = dict.fromkeys(NUMBERS, zero)
-        return SafetyRecord(**dict.fromkeys(EVENTS, no), **numbers, overflow=no)
+        return SafetyRecord(
+            **{name: no if fold == "any" else zero for name, fold in FOLDS.items()}
+        )
 
     @property
     def event(self) -> Bool[Array, ""]:
@@ -90,76 +119,39 @@ class SafetyRecord(Pytree):
         return self.collision | self.self_collision | self.joint_limit
 
     @property
-    def flags(self) -> dict[str, Bool[Array, ""]]:
-        """The `EVENTS` by name."""
-        return {name: getattr(self, name) for name in EVENTS}
+    def events(self) -> dict[str, Bool[Array, ""]]:
+        """The flags that are counted when they begin, by name."""
+        return {n: getattr(self, n) for n, metric in METRICS.items() if metric.event}
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Everything else, by name."""
+        names = (n for n, metric in METRICS.items() if not metric.event)
+        return {name: getattr(self, name) for name in names}
 
     def then(self, step: SafetyRecord, share: float) -> SafetyRecord:
-        """This record extended by one physics step that is `share` of the whole."""
-        flags = {name: on | getattr(step, name) for name, on in self.flags.items()}
-        return SafetyRecord(
-            **flags,
-            force=self.force + share * step.force,
-            force_peak=jnp.maximum(self.force_peak, step.force_peak),
-            work_force=self.work_force + share * step.work_force,
-            work_force_peak=jnp.maximum(self.work_force_peak, step.work_force_peak),
-            saturation=self.saturation + share * step.saturation,
-            torque_jump=jnp.maximum(self.torque_jump, step.torque_jump),
-            reversals=self.reversals + share * step.reversals,
-            jerk=jnp.maximum(self.jerk, step.jerk),
-            overflow=self.overflow | step.overflow,
-        )
+        """This record extended by one physics step.
+
+        Args:
+            step: The record of that step.
+            share: The step's share of the policy step.
+        """
+
+        def extended(name: str, fold: Fold) -> Array:
+            old, new = getattr(self, name), getattr(step, name)
+            if fold == "any":
+                return old | new
+            return jnp.maximum(old, new) if fold == "max" else old + share * new
+
+        return SafetyRecord(**{n: extended(n, fold) for n, fold in FOLDS.items()})
 
 
-class Torques(Pytree):
-    """Torques of the last physics steps: what their smoothness is read from."""
-
-    tau: Float[Array, " n"]
-    """Torques [N m]."""
-    change: Float[Array, " n"]
-    """Their change in the last step [N m]."""
-    back: Bool[Array, ""]
-    """Whether one of them turned round in it."""
-    first: Bool[Array, ""]
-    """Whether there is no step yet."""
-
-    @staticmethod
-    def none(n: int) -> Torques:
-        """Before the first step with a new set-point: its jump is the policy's."""
-        zero = jnp.zeros(n)
-        return Torques(zero, zero, jnp.zeros((), bool), jnp.ones((), bool))
-
-    def then(self, tau: Float[Array, " n"]) -> Torques:
-        """One step on."""
-        change = jnp.where(self.first, 0.0, tau - self.tau)
-        turned = change * self.change < 0
-        large = jnp.minimum(jnp.abs(change), jnp.abs(self.change)) > REVERSAL
-        return Torques(tau, change, jnp.any(turned & large), jnp.zeros((), bool))
-
-
-class Motion(Pytree):
-    """Velocities of the last physics steps: what the joints' jerk is read from."""
-
-    qd: Float[Array, " n"]
-    """Joint velocities [rad/s]."""
-    qdd: Float[Array, " n"]
-    """Their change in the last step, over its time [rad/s^2]."""
-    jerk: Float[Array, " n"]
-    """The change of that, over the time of a step [rad/s^3]."""
-    first: Bool[Array, ""]
-    """Whether there is no step yet."""
-
-    @staticmethod
-    def none(qd: Float[Array, " n"]) -> Motion:
-        """Before the first step with a new set-point: its jerk is the policy's."""
-        zero = jnp.zeros_like(qd)
-        return Motion(qd, zero, zero, jnp.ones((), bool))
-
-    def then(self, qd: Float[Array, " n"], dt: float) -> Motion:
-        """One step of `dt` [s] on."""
-        qdd = (qd - self.qd) / dt
-        jerk = jnp.where(self.first, 0.0, (qdd - self.qdd) / dt)
-        return Motion(qd, qdd, jerk, jnp.zeros((), bool))
+FOLDS: dict[str, Fold] = {
+    field.name: field.metadata["fold"] for field in dataclasses.fields(SafetyRecord)
+}
+"""How each field folds, by name."""
+METRICS = of_fields(SafetyRecord)
+"""The metric of each field, by name."""
 
 
 def observe(
@@ -170,7 +162,16 @@ def observe(
     motion: Motion,
     torque_scale: Float[Array, ""],
 ) -> SafetyRecord:
-    """The record of the physics step that led to `state`."""
+    """The record of the physics step that led to `state`.
+
+    Args:
+        scene: The scene.
+        robot: The arm.
+        state: Physics after the step.
+        torques: Torques up to this step.
+        motion: Velocities up to this step.
+        torque_scale: Below 1 where a torque was at its limit.
+    """
     contacts = read_contacts(scene.model, state)
     q = state.qpos[: robot.n]
     near_lower = q - robot.q_lower < LIMIT_MARGIN
@@ -185,13 +186,13 @@ def observe(
         self_collision=jnp.any(contacts.touching & scene.own),
         joint_limit=jnp.any(near_lower | near_upper),
         turn_limit=jnp.any(free & (jnp.abs(q) > TURN - LIMIT_MARGIN)),
-        force=jnp.sum(unwanted),
-        force_peak=jnp.max(unwanted, initial=0.0),
+        contact_force=jnp.sum(unwanted),
+        contact_force_peak=jnp.max(unwanted, initial=0.0),
         work_force=work,
         work_force_peak=work,
-        saturation=(torque_scale < 1.0).astype(q.dtype),
+        torque_saturation=(torque_scale < 1.0).astype(q.dtype),
         torque_jump=jnp.max(jnp.abs(torques.change)),
-        reversals=torques.back.astype(q.dtype),
-        jerk=jnp.max(jnp.abs(motion.jerk)),
-        overflow=jnp.any(contacts.overflow),
+        torque_reversals=torques.reversed.astype(q.dtype),
+        joint_jerk=jnp.max(jnp.abs(motion.jerk)),
+        contact_overflow=jnp.any(contacts.overflow),
     )

@@ -13,7 +13,9 @@ from envs import options
 from envs.base import ArmEnv
 from envs.placement import sample_apart
 from envs.safety import SafetyRecord
-from envs.types import Entry, Score
+from envs.types import Entry, Score, State
+from envs.views import CURRENT, LATER, REACHED, Mark
+from rmp_mjx.metric import Metric
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
 
@@ -34,7 +36,7 @@ class TrajectoryOptions(options.Options):
     list of positions and checked flags."""
 
 
-class Trajectory(ArmEnv):
+class Trajectory(ArmEnv[TrajectoryOptions]):
     """Reach four random via points, one after the other.
 
     Reward: 100 on reaching the current point (within 5 cm), else 30 (1 - tanh(5 d));
@@ -44,7 +46,9 @@ class Trajectory(ArmEnv):
     Options = TrajectoryOptions
     q_start = np.array([3.192, 3.680, 0.0, 1.170, 0.050, 3.760, 3.142])
     sphere_box = (BOX_LOW, BOX_HIGH)
-    task_metrics: ClassVar[dict[str, str]] = {"via_points": "sum"}
+    task_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("via_points", "sum", headline="via", table=("mean",)),
+    )
     n_points = 4
     reach = 0.05
     """A via point counts as reached within this distance [m]."""
@@ -107,3 +111,16 @@ class Trajectory(ArmEnv):
             order = (jnp.arange(self.n_points) + reached) % self.n_points
             points, checked = points[order] - site.p, checked[order]
         return {"points": points, "reached": checked}
+
+    def marks(self, state: State) -> list[Mark]:
+        """Balls at the via points: reached, current, later."""
+        reached = int(state.task["reached"])
+        return [
+            Mark(
+                "ball",
+                np.asarray(point, float),
+                0.018,
+                REACHED if k < reached else CURRENT if k == reached else LATER,
+            )
+            for k, point in enumerate(state.task["points"])
+        ]

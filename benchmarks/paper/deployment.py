@@ -17,6 +17,7 @@ from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.columns import COLUMNS, PICTURED, TABLE, Column
 from benchmarks.paper.store import Store
 from benchmarks.paper.training import run_of
+from rmp_mjx.metric import reductions
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.runs.loop import load_agent
@@ -83,7 +84,7 @@ def deploy(
         "seconds": time.monotonic() - began,
         "training_iterations": iterations,
         "dt": env.dt,
-        "reductions": dict(env.metric_reductions),
+        "reductions": reductions(env.metrics),
         "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "machine": machine(),
     }

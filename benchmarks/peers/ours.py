@@ -24,6 +24,7 @@ from benchmarks.peers.problem import controller
 from benchmarks.peers.worker import Measure, latency, rate, serve
 from benchmarks.speed.bench_controller import BATCH, random_states
 from rmp_mjx import runtime
+from rmp_mjx.metric import SUCCESS, Metric, by_name
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning.ppo import make_ppo
 
@@ -106,13 +107,13 @@ class PointTask:
     physics = "point mass"
 
     @property
-    def metric_reductions(self) -> dict[str, str]:
+    def metrics(self) -> dict[str, Metric]:
         """Metrics, as a trainer needs them."""
-        return {"success": "max", "collision": "sum"}
+        return by_name([SUCCESS, Metric("collision", "sum", event=True)])
 
     def reset(self, rng):
         """Start somewhere."""
-        return Point.start(rng, dict.fromkeys(self.metric_reductions, jnp.zeros(())))
+        return Point.start(rng, dict.fromkeys(self.metrics, jnp.zeros(())))
 
     def step(self, state, action):
         """One step."""

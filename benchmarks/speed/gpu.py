@@ -216,7 +216,7 @@ def training(
         ]
         if judge:
             results = jax.device_get(judge.result()[0](state, jax.random.key(1)))
-            summary = evaluate.summarise(results, env.metric_reductions)
+            summary = evaluate.summarise(results, env.metrics)
             judged = f"{episodes:,} episodes; {note}"
             rows += [
                 (f"eval_{name}_rate", summary[f"{name}_rate"], "-", judged)

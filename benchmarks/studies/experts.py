@@ -80,7 +80,7 @@ def command(env: ArmEnv, state: State, R: Array, target: Array) -> Array:
 
 def follow(env: ArmEnv, state: State, memory: Memory) -> tuple[Memory, Array]:
     """Trajectory following: straight to the current via point."""
-    points, reached = state.info["points"], state.info["reached"]
+    points, reached = state.task["points"], state.task["reached"]
     target = points[jnp.minimum(reached, len(points) - 1)]
     return memory, command(env, state, memory.R, target)
 
@@ -110,7 +110,7 @@ HEIGHT_OVER, HEIGHT_PUSH = 0.065, 0.005
 def push(env: Any, state: State, memory: Memory) -> tuple[Memory, Array]:
     """Block pushing: over the block, down behind it, push; again if it slipped off."""
     p, block = env.site(state.data).p, env.block(state.data)
-    way = (state.info["goal"] - block)[:2]
+    way = (state.task["goal"] - block)[:2]
     left = jnp.linalg.norm(way)
     ahead = way / jnp.maximum(left, 1e-6)
     aside = jnp.array([-ahead[1], ahead[0]])

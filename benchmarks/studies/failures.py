@@ -72,7 +72,7 @@ def crossing_start(env: ArmEnv, key: Array, case: Crossing) -> tuple[World, Arra
     """
     key_reset, key_side = jax.random.split(key)
     state = env.reset(key_reset)
-    grip, points = env.site(state.data).p, state.info["points"]
+    grip, points = env.site(state.data).p, state.task["points"]
     length = jnp.linalg.norm(points - grip, axis=-1)
     target = points[jnp.argmax(length)]
     ahead = (target - grip) / jnp.max(length)
@@ -86,7 +86,10 @@ def crossing_start(env: ArmEnv, key: Array, case: Crossing) -> tuple[World, Arra
     state = state.replace(
         data=state.data.replace(mocap_pos=center),
         info=state.info
-        | {"points": jnp.tile(target, (len(points), 1)), "spheres": told},
+        | {
+            "task": state.task | {"points": jnp.tile(target, (len(points), 1))},
+            "spheres": told,
+        },
     )
     fits = (jnp.max(length) > 0.24) & (env.clearance(state.data, told) > 0.03)
     special = {"noise": 0.0, "delay": 0.0, "torque": case.torque}
@@ -118,7 +121,7 @@ def cross(controller: str, cases: Crossing, worlds: int, seed: int) -> list[Figu
 
         def step(world: World, key: Array) -> tuple[World, dict[str, Array]]:
             world, figures = advance(env, world, key, policy)
-            going = world.state.info["reached"] == 0
+            going = world.state.task["reached"] == 0
             return world, figures | {"going": going}
 
         return jax.lax.scan(step, world, jax.random.split(key, REACHING))[1]

@@ -34,6 +34,7 @@ from benchmarks.common import machine
 from envs.brax import BraxTask
 from envs.types import State
 from rmp_mjx import runtime
+from rmp_mjx.metric import Metric
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.learning.networks import make_agent
@@ -64,7 +65,7 @@ class Reach:
 
     observation_size, action_size = 4, 2
     dt, episode_length = 0.05, 50
-    metric_reductions = {"distance": "last"}  # noqa: RUF012
+    metrics = {"distance": Metric("distance", "last", unit="m")}  # noqa: RUF012
     options = SimpleNamespace(physics="none")
 
     def reset(self, rng):

@@ -258,9 +258,9 @@ def _pick(mask: Array, new: Any, old: Any) -> Any:
 
 def to_target(env: ArmEnv, state: State) -> Array:
     """Vector from the grip to its via point; zero in tasks without one."""
-    if "points" not in state.info:
+    if "points" not in state.task:
         return jnp.zeros(3)
-    points, reached = state.info["points"], state.info["reached"]
+    points, reached = state.task["points"], state.task["reached"]
     return points[jnp.minimum(reached, len(points) - 1)] - env.site(state.data).p
 
 

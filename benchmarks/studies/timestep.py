@@ -20,7 +20,8 @@ import numpy as np
 import envs
 from benchmarks.common import Row, show, write_json
 from benchmarks.png import save_figure
-from envs.safety import Motion, Torques, observe
+from envs.safety import observe
+from envs.smoothness import Motion, Torques
 from rmp_mjx import runtime
 from rmp_mjx.robot.kinematics import site_pose
 from rmp_mjx.sim import PhysicsState, load_physics, read_contacts
@@ -113,14 +114,14 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
             after = env.physics.step(data, out.tau)
             torques = torques.then(out.tau)
             scale = out.diagnostics["torque_scale"]
-            motion = Motion.none(after.qvel[:n])  # its jerk is not used
+            motion = Motion.start(after.qvel[:n])  # its jerk is not used
             now = observe(env.scene, env.robot, after, torques, motion, scale)
             jump = jnp.maximum(jump, now.torque_jump)
-            force = jnp.maximum(force, now.force_peak)
+            force = jnp.maximum(force, now.contact_force_peak)
             return (after, torques, event | now.event, force, jump), None
 
         nothing = jnp.zeros((), bool), jnp.zeros(()), jnp.zeros(())
-        start = (data, Torques.none(n), *nothing)
+        start = (data, Torques.start(n), *nothing)
         (after, torques, event, force, jump), _ = jax.lax.scan(
             substep, start, None, length=env.n_substeps
         )

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rmp_mjx.report.runs import Group
-from rmp_mjx.training.evaluation.figures import curves
+from rmp_mjx.training.evaluation import curves
 from rmp_mjx.training.runs.metrics import over_seeds
 from rmp_mjx.training.stats import clopper_pearson
 

@@ -14,7 +14,7 @@ LANES = 8
 class Torques(Pytree):
     """A controller that compiles fast: the action is a torque on top of `hold`."""
 
-    hold: jax.Array
+    hold: jax.Array | np.ndarray
 
     def decode(self, action):
         return action

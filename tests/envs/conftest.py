@@ -70,7 +70,8 @@ def quiet(far):
     points = jnp.array(
         [[0.3, 0.2, 0.2], [0.5, 0.2, 0.2], [0.5, -0.2, 0.2], [0.3, 0, 0.3]]
     )
-    info = state.info | {"points": jnp.tile(points, (LANES, 1, 1))}
+    task = state.task | {"points": jnp.tile(points, (LANES, 1, 1))}
+    info = state.info | {"task": task}
     return state.replace(data=data, info=info)
 
 

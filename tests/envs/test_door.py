@@ -51,7 +51,7 @@ def score(env, data, site=None, held=0, **record):
     site = env.site(data) if site is None else site
     record = {name: jnp.asarray(value) for name, value in record.items()}
     task = {"held": jnp.int32(held), "grip_force": jnp.zeros(())}
-    return env.score(data, site, SafetyRecord.none().replace(**record), task, 1)
+    return env.score(data, site, SafetyRecord.empty().replace(**record), task, 1)
 
 
 @pytest.mark.parametrize(("angle", "rate"), [(0.0, 0.0), (0.4, 1.2), (1.3, -0.5)])
@@ -226,7 +226,7 @@ def test_forces_beyond_100_newton_cost(env, starts, force, cost):
     """Collisions and work count together."""
     data, (unwanted, work) = opened(starts, 0.3), force
     calm = score(env, data).reward
-    hard = score(env, data, force=unwanted, work_force=work).reward
+    hard = score(env, data, contact_force=unwanted, work_force=work).reward
     assert float(calm - hard) == pytest.approx(cost, abs=1e-4)
 
 

@@ -19,10 +19,11 @@ def test_both_engines_step_the_task_alike(make, close, quiet):
     mjx = make("torques", physics="mjx", **switches, **options)
     action = jnp.zeros((LANES, 12)).at[0, 1].set(-25.0)
     ours, theirs = quiet, quiet
+    flags = []
     for _ in range(10):
         ours, theirs = mjx.step(ours, action), close.step(theirs, action)
         flags = [np.asarray(s.metrics["collision"]) for s in (ours, theirs)]
-        np.testing.assert_array_equal(*flags)
+        np.testing.assert_array_equal(flags[0], flags[1])
         if np.any(flags[1]):
             break
         np.testing.assert_allclose(ours.obs, theirs.obs, atol=1e-3)

@@ -47,7 +47,7 @@ def test_gymnasiums_checker_accepts_it(single):
 
 
 def test_an_episode_is_truncated_at_the_time_limit_and_its_metrics_are_info(single):
-    single.reset(seed=1)
+    _, info = single.reset(seed=1)
     for k in range(1, LIMIT + 1):
         obs, reward, terminated, truncated, info = single.step(still(single))
         assert obs.dtype == np.float32 and isinstance(reward, float)

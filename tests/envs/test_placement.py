@@ -20,10 +20,11 @@ def distances(a, b):
 @pytest.fixture(params=["far", "close"])
 def layout(request):
     task = request.getfixturevalue(request.param)
-    info, data = task.starts.info, task.starts.data
-    placed = np.asarray(info["spheres"].placed)
-    points, centers = (np.asarray(x, float) for x in (info["points"], data.mocap_pos))
-    return request.param, task, points, centers, placed, np.asarray(data.qpos)
+    starts = task.starts
+    placed = np.asarray(starts.info["spheres"].placed)
+    points = np.asarray(starts.task["points"], float)
+    centers = np.asarray(starts.data.mocap_pos, float)
+    return request.param, task, points, centers, placed, np.asarray(starts.data.qpos)
 
 
 def test_via_points_are_in_their_box_and_apart(layout):
@@ -79,7 +80,7 @@ def test_layouts_differ_as_their_names_say(far, close):
     """`close` spheres come nearer to the via points than `far` ones ever do."""
     nearest = [
         distances(
-            np.asarray(t.starts.data.mocap_pos), np.asarray(t.starts.info["points"])
+            np.asarray(t.starts.data.mocap_pos), np.asarray(t.starts.task["points"])
         )
         for t in (far, close)
     ]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs.push import FARTHEST_GOAL, GOAL_HIGH, GOAL_LOW, NEAREST_GOAL
+from envs.push import FARTHEST_GOAL, GOAL_HIGH, GOAL_LOW, NEAREST_GOAL, PushOptions
 from envs.safety import SafetyRecord
 from envs.scene import TABLE_HEIGHT
 from rmp_mjx.robot import Robot
@@ -55,13 +55,13 @@ def score(env, lane, grip, block, goal):
     n = env.robot.n
     data = lane.data.replace(qpos=lane.data.qpos.at[n : n + 3].set(jnp.array(block)))
     site = env.site(data).replace(p=jnp.array(grip))
-    task = {"start": lane.info["start"], "goal": jnp.array(goal)}
-    return env.score(data, site, SafetyRecord.none(), task, 1)
+    task = {"start": lane.task["start"], "goal": jnp.array(goal)}
+    return env.score(data, site, SafetyRecord.empty(), task, 1)
 
 
 def test_block_and_goal_start_in_their_areas_ten_to_25_centimetres_apart(starts):
     block = np.asarray(starts.data.qpos[:, 7:10])
-    goal = np.asarray(starts.info["goal"])
+    goal = np.asarray(starts.task["goal"])
     assert np.all((block[:, 0] > 0.42) & (block[:, 0] < 0.52))
     assert np.all(np.abs(block[:, 1]) < 0.10)
     assert np.all((goal[:, :2] >= GOAL_LOW) & (goal[:, :2] <= GOAL_HIGH))
@@ -101,7 +101,7 @@ def test_the_tree_keeps_the_links_but_not_the_hand_off_the_block(env, lane):
 def test_a_block_that_is_not_touched_rests(env, lane):
     """It sinks into the soft contact by less than 0.5 mm, in 1 s of MuJoCo C."""
     _, d = settled(env, lane)
-    start = np.asarray(lane.info["start"])
+    start = np.asarray(lane.task["start"])
     np.testing.assert_allclose(d.qpos[7:10], start, atol=5e-4)
     assert np.abs(d.qvel[7:]).max() < 1e-3
 
@@ -183,13 +183,13 @@ def test_reward_of_hand_and_block(env, plain, lane, grip, block, guided):
 def test_the_observation_leads_from_hand_to_block_to_goal(env, plain, lane, guided):
     """And, guided, to where the hand belongs: behind the block, seen from the goal."""
     env = env if guided else plain
-    task = {name: lane.info[name] for name in ("start", "goal")}
+    task = {name: lane.task[name] for name in ("start", "goal")}
     site = env.site(lane.data)
     seen = env.observe(lane.data, site, task)
     block = site.p + seen["hand_to_block"]
     np.testing.assert_allclose(block, lane.data.qpos[7:10], atol=1e-6)
     goal = block + seen["block_to_goal"]
-    np.testing.assert_allclose(goal, lane.info["goal"], atol=1e-6)
+    np.testing.assert_allclose(goal, lane.task["goal"], atol=1e-6)
     names = [entry.name for entry in env.task_entries]
     assert names == ["hand_to_block", "block_to_goal", "hand_to_place"][: 2 + guided]
     place = site.p + seen["hand_to_place"] - block
@@ -225,7 +225,7 @@ def test_spheres_leave_block_and_goal_free(env, starts):
         x, y, up = (center - qpos[:, 7:10]).T
         local = np.stack([c * x + s * y, c * y - s * x, up], axis=1)
         over = np.linalg.norm(np.maximum(np.abs(local) - 0.03, 0.0), axis=1)
-        away = center - np.asarray(starts.info["goal"])
+        away = center - np.asarray(starts.task["goal"])
         radial = np.maximum(np.hypot(*away[:, :2].T) - np.sqrt(2) * 0.03, 0.0)
         goal = np.hypot(radial, np.maximum(np.abs(away[:, 2]) - 0.03, 0.0))
         gap = min(gap, over[placed[:, i]].min(), goal[placed[:, i]].min())
@@ -235,4 +235,4 @@ def test_spheres_leave_block_and_goal_free(env, starts):
 @pytest.mark.parametrize("name", ["block_mass", "block_friction"])
 def test_a_block_without_mass_or_friction_is_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive, got 0"):
-        envs.load("push", **{name: 0.0})
+        PushOptions(**{name: 0.0})

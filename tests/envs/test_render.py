@@ -56,7 +56,9 @@ def test_the_spheres_are_where_the_state_says(draw):
 
 def test_reached_points_change_their_colour(draw):
     def finished(state):
-        return state.replace(info=state.info | {"reached": np.int32(4)})
+        return state.replace(
+            info=state.info | {"task": state.task | {"reached": np.int32(4)}}
+        )
 
     start, end = draw("trajectory", finished)
     assert greenish(start) == 0
@@ -65,8 +67,8 @@ def test_reached_points_change_their_colour(draw):
 
 def test_the_goal_of_pushing_is_drawn(draw):
     def hidden(state):
-        goal = np.full_like(state.info["goal"], 5.0)
-        return state.replace(info=state.info | {"goal": goal})
+        goal = np.full_like(state.task["goal"], 5.0)
+        return state.replace(info=state.info | {"task": {"goal": goal}})
 
     shown, gone = draw("push", hidden)
     assert greenish(shown) > 10

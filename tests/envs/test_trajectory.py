@@ -10,17 +10,17 @@ from tests.envs.arm_tasks import LANES, first
 REST = jnp.zeros((LANES, 12))
 
 
-def with_info(state, **info):
-    info = {name: jnp.asarray(value) for name, value in info.items()}
-    return state.replace(info=state.info | info)
+def with_task(state, **values):
+    values = {name: jnp.asarray(value) for name, value in values.items()}
+    return state.replace(info=state.info | {"task": state.task | values})
 
 
 def points_at(arm, state, which, distance):
     """Via points of which the given ones are `distance` from the grip, sideways."""
-    points = np.array(state.info["points"])
+    points = np.array(state.task["points"])
     grip = arm.site(np.asarray(state.data.qpos[0]))[0]
     points[:, which] = grip + np.array([0.0, distance, 0.0])
-    return with_info(state, points=points)
+    return with_task(state, points=points)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def moving(far):
     keys = jax.random.split(jax.random.key(3), 2)
     qd = 0.2 * jax.random.normal(keys[0], state.data.qvel.shape)
     state = state.replace(data=state.data.replace(qvel=qd))
-    state = with_info(state, reached=np.arange(LANES) % 4)
+    state = with_task(state, reached=np.arange(LANES) % 4)
     action = jax.random.uniform(keys[1], (LANES, 12), minval=-1.0, maxval=1.0)
     return state, action, far.step(state, action)
 
@@ -40,7 +40,7 @@ def test_stepping_keeps_the_structure_of_the_state(far, moving):
     assert jax.tree.structure(before) == jax.tree.structure(after)
     shapes = [jax.tree.map(lambda x: (x.shape, x.dtype), s) for s in (before, after)]
     assert shapes[0] == shapes[1]
-    assert after.metrics.keys() == far.env.metric_reductions.keys()
+    assert after.metrics.keys() == far.env.metrics.keys()
     assert after.obs.shape == (LANES, far.env.observation_size)
     for x in (after.reward, after.done, *after.metrics.values()):
         assert x.shape == (LANES,) and x.dtype == jnp.float32
@@ -61,10 +61,10 @@ def test_a_batch_is_a_loop_over_its_lanes(far, moving):
 
 def expected_reward(env, arm, before, after, lane):
     """The docstring's formula, from the two states alone."""
-    reached = int(before.info["reached"][lane])
+    reached = int(before.task["reached"][lane])
     if reached == 4:
         return 0.0, 4
-    target = np.asarray(before.info["points"][lane, reached], float)
+    target = np.asarray(before.task["points"][lane, reached], float)
     d = np.linalg.norm(target - arm.site(np.asarray(after.data.qpos[lane]))[0])
     if d >= 0.05:
         return 30 * (1 - np.tanh(5 * d)), reached
@@ -79,7 +79,7 @@ def test_reward_is_the_formula(far, arm, moving):
         reward, reached = expected_reward(far.env, arm, state, after, lane)
         cost = 50.0 if event(after, lane) else 0.0
         assert after.reward[lane] == pytest.approx(reward - cost, rel=1e-5, abs=1e-3)
-        assert int(after.info["reached"][lane]) == reached
+        assert int(after.task["reached"][lane]) == reached
 
 
 def event(state, lane):
@@ -94,14 +94,14 @@ def test_observation_is_the_formula(which, request, arm):
     Absolute 2e-5 (m, m/s): float32 kinematics.
     """
     task = request.getfixturevalue(which)
-    state = with_info(first(task.starts), reached=np.arange(LANES) % 5)
+    state = with_task(first(task.starts), reached=np.arange(LANES) % 5)
     action = 0.3 * jnp.ones((LANES, 12))
     after = task.step(state, action)
     for lane in range(LANES):
         q, qd = (np.asarray(x[lane]) for x in (after.data.qpos, after.data.qvel))
         p, R, v, w = arm.site(q, qd)
-        points = np.asarray(after.info["points"][lane], float)
-        k = int(after.info["reached"][lane])
+        points = np.asarray(after.task["points"][lane], float)
+        k = int(after.task["reached"][lane])
         flags = (np.arange(4) < k).astype(float)
         if which == "far":
             points, flags = np.roll(points - p, -k, axis=0), np.roll(flags, -k)
@@ -112,10 +112,10 @@ def test_observation_is_the_formula(which, request, arm):
 def test_points_count_in_their_order_only(far, arm, quiet):
     """The grip is on the third point: nothing, until the first two are reached."""
     state = points_at(arm, quiet, [2], 0.01)
-    state = with_info(state, reached=np.array([0, 1, 2, 3, 4, 0, 1, 2]))
+    state = with_task(state, reached=np.array([0, 1, 2, 3, 4, 0, 1, 2]))
     after = far.step(state, REST)
     np.testing.assert_array_equal(after.metrics["via_points"], [0, 0, 1, 0, 0, 0, 0, 1])
-    np.testing.assert_array_equal(after.info["reached"], [0, 1, 3, 3, 4, 0, 1, 3])
+    np.testing.assert_array_equal(after.task["reached"], [0, 1, 3, 3, 4, 0, 1, 3])
     np.testing.assert_allclose(np.asarray(after.reward)[[2, 7]], 100.0)
     assert after.reward[4] == 0.0  # after the last point there is nothing to earn
 
@@ -131,13 +131,14 @@ def test_points_on_one_spot_are_reached_one_a_step(far, arm, quiet):
     state = points_at(arm, quiet, slice(None), 0.0)
     for count in range(1, 5):
         state = far.step(state, REST)
-        assert np.all(state.info["reached"] == count)
+        assert np.all(state.task["reached"] == count)
         assert np.all(state.metrics["success"] == (count == 4))
 
 
 def test_finishing_pays_for_the_steps_left_and_ends_the_episode(far, arm, quiet):
     state = points_at(arm, quiet, [3], 0.0)
-    state = with_info(state, reached=np.full(LANES, 3), step=np.arange(LANES) * 100)
+    state = with_task(state, reached=np.full(LANES, 3))
+    state = state.replace(info=state.info | {"step": jnp.arange(LANES) * 100})
     after = far.step(state, REST)
     left = 1024 - (np.arange(LANES) * 100 + 1)
     np.testing.assert_allclose(after.reward, 100 + 25 * left)
@@ -145,7 +146,7 @@ def test_finishing_pays_for_the_steps_left_and_ends_the_episode(far, arm, quiet)
 
 
 def test_finishing_need_not_end_the_episode(close, arm, quiet):
-    state = with_info(points_at(arm, quiet, [3], 0.0), reached=np.full(LANES, 3))
+    state = with_task(points_at(arm, quiet, [3], 0.0), reached=np.full(LANES, 3))
     state = close.step(state, REST)
     assert np.all(state.done == 0) and np.all(state.metrics["success"] == 1)
     state = close.step(state, REST)

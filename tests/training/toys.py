@@ -8,7 +8,17 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from rmp_mjx.metric import SUCCESS, Metric, by_name
 from rmp_mjx.pytree import Pytree
+
+METRICS = (
+    SUCCESS,
+    Metric("collision", "sum", event=True, headline="coll", table=("rate",)),
+    Metric("contact_force_peak", "max", "contact peak", "N", table=("max",)),
+    Metric("clearance", "min", unit="m", table=("mean", "min")),
+    Metric("effort", "mean", table=("mean",)),
+    Metric("final", "last", table=("mean",)),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,13 +58,9 @@ class Toy:
     episode_length: int = 1
     engine: str = "toy"
 
-    task_metrics = {"effort": "mean", "final": "last"}  # noqa: RUF012
-
     @property
-    def metric_reductions(self):
-        events = {"success": "max", "collision": "sum"}
-        safety = {"contact_force_peak": "max", "clearance": "min"}
-        return events | safety | self.task_metrics
+    def metrics(self):
+        return by_name(METRICS)
 
     def _state(self, data, obs, reward, done, action=0.0):
         return ToyState(
@@ -191,8 +197,8 @@ class Poisoned(Counter):
     flag: bool = False
 
     @property
-    def metric_reductions(self):
-        return super().metric_reductions | {"nonfinite": "max"}
+    def metrics(self):
+        return by_name([*METRICS, Metric("nonfinite", "max", fault="exploded")])
 
     def _state(self, data, obs, reward, done, action=0.0):
         bad = (obs[1] == 2.0) & (obs[2] < 0.1)

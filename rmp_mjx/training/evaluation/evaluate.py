@@ -10,6 +10,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
+from rmp_mjx.metric import SUCCESS, Metric, reductions
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.evaluation import recording
 from rmp_mjx.training.evaluation.recording import Recording
@@ -100,7 +101,7 @@ def play(
     A lane whose episode has ended takes the next one; it waits until there are enough
     of them for a reset to be worth its time.
     """
-    kinds = env.metric_reductions
+    kinds = reductions(env.metrics)
     key_reset, key_act = jax.random.split(key)
     starts = jax.random.split(key_reset, num)
     count = min(num, LANES)
@@ -182,7 +183,7 @@ def _zeros(shape: jax.ShapeDtypeStruct) -> Array:
     return jnp.zeros(shape.shape, shape.dtype)
 
 
-def summarise(results: Episodes, reductions: Mapping[str, str]) -> dict[str, Any]:
+def summarise(results: Episodes, metrics: Mapping[str, Metric]) -> dict[str, Any]:
     """Statistics of evaluation episodes.
 
     Rates carry 95 % Clopper-Pearson intervals (`..._rate_ci95`), means bootstrap
@@ -190,10 +191,10 @@ def summarise(results: Episodes, reductions: Mapping[str, str]) -> dict[str, Any
 
     Args:
         results: Values of each episode.
-        reductions: How the environment's metrics fold: those that sum are events,
-            counted by episodes that had any; `success` is a rate; the others are
-            summed up by mean, 95th percentile and maximum, those that fold by the
-            minimum by mean, 5th percentile and minimum.
+        metrics: The environment's metrics. Each gives its mean, and by its reduction:
+            `sum` the share of episodes above 0 and the sum per 1,000 policy steps;
+            `min` the 5th percentile and the minimum; the others the 95th percentile
+            and the maximum. Of `success` there is the rate alone.
 
     Returns:
         JSON-ready values by name.
@@ -217,9 +218,9 @@ def summarise(results: Episodes, reductions: Mapping[str, str]) -> dict[str, Any
 
     mean("return")
     mean("length")
-    for name, kind in sorted(reductions.items()):
-        values = results[name].astype(np.float64)
-        if name == "success":
+    for name, metric in sorted(metrics.items()):
+        values, kind = results[name].astype(np.float64), metric.reduction
+        if name == SUCCESS.name:
             rate(name, int((values > 0.5).sum()))
             continue
         mean(name)

@@ -14,7 +14,7 @@ from rmp_mjx.training.evaluation import style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORCES = np.geomspace(0.1, 1e4, 26)
+FORCES = np.geomspace(0.1, 1e4, 26).tolist()
 """Bins of the force histogram, five a decade [N]."""
 COLORS = (style.RUN, style.OTHER)
 """One for each engine."""
@@ -64,7 +64,7 @@ def plot_clearances(
     with style.page(picture, 1, 1, SIZE) as (figure, (axis,)):
         values = [1e3 * x for x in clearances.values()]
         low, high = min(map(np.min, values)), max(map(np.max, values))
-        bins = np.linspace(min(low, 0.0), max(high, 1.0), 31)
+        bins = np.linspace(min(low, 0.0), max(high, 1.0), 31).tolist()
         for name, x, color in zip(clearances, values, COLORS, strict=False):
             label = f"{name}: median {np.median(x):.0f} mm, least {np.min(x):.1f} mm"
             axis.hist(x, bins, alpha=0.6, color=color, label=label)

@@ -1,7 +1,7 @@
 """What an evaluation leaves for its reader: a table, eval.json, plots."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from rmp_mjx.files import write_text
-from rmp_mjx.training.evaluation import figures
+from rmp_mjx.metric import LENGTH, RETURN, Metric, Statistic, number
+from rmp_mjx.training.evaluation import histograms
 from rmp_mjx.training.evaluation.evaluate import Episodes, over_seeds, summarise
 from rmp_mjx.training.runs import run_folder
 
@@ -21,83 +22,73 @@ Columns = Mapping[str, Summary]
 TERMINAL = 80
 """Columns of a terminal that the table must fit."""
 
-MEASURES = (
-    ("mean return", "return_mean", 1.0),
-    ("success [%]", "success_rate", 100.0),
-    ("collision [%]", "collision_rate", 100.0),
-    ("joint limit [%]", "joint_limit_rate", 100.0),
-    ("self-collision [%]", "self_collision_rate", 100.0),
-    ("policy steps", "length_mean", 1.0),
-    ("worst contact [N]", "contact_force_peak_max", 1.0),
-    ("least clearance [mm]", "clearance_mean", 1e3),
-    ("its worst [mm]", "clearance_min", 1e3),
-    ("force at work [N]", "work_force_mean", 1.0),
-    ("torque saturated [%]", "torque_saturation_mean", 100.0),
-    ("set-point error [mm]", "tracking_error_mean", 1e3),
-)
-"""What the table shows where a task has it: label, name in a summary, factor.
-
-Shares are of the episodes, that of saturation is of the time.
-"""
-
-FAULTS = (
-    ("episodes lost to a non-finite state", "lost_episodes"),
-    ("most spheres without a place in an episode", "unplaced_obstacles_max"),
-    ("steps with more contacts than were read", "contact_overflow_max"),
-)
-"""What the table's caption mentions where it happened: label, name in a summary."""
+LOST = "episodes lost to a non-finite state"
 
 
-def table(columns: Columns, title: str, own: Iterable[str] = ()) -> Table:
-    """The measures that a reader wants first, with 95 % intervals.
+def table(columns: Columns, title: str, metrics: Mapping[str, Metric]) -> Table:
+    """What the metrics want shown of an evaluation, with 95 % intervals.
+
+    A row without a further word is a mean, or for `%` a share: of the episodes, or of
+    the time. Below the table stands what went wrong.
 
     Args:
         columns: Summaries by engine.
         title: What was evaluated.
-        own: Metrics of the task itself, shown by their means.
+        metrics: The environment's metrics.
     """
-    faults = [
-        f"{label}: {summary[key]:g} ({engine})"
-        for label, key in FAULTS
+    faults = [(LOST, "lost_episodes")]
+    faults += [(m.fault, f"{m.name}_max") for m in metrics.values() if m.fault]
+    caption = [
+        f"{fault}: {summary[key]:g} ({engine})"
+        for fault, key in faults
         for engine, summary in columns.items()
         if summary.get(key)
     ]
     shown = Table(
         title=escape(title),
-        caption="\n".join(faults) or None,
+        caption="\n".join(caption) or None,
         min_width=min(len(title), TERMINAL),
     )
     shown.add_column("episodes (95 %)")
     for engine in columns:
         shown.add_column(escape(engine), justify="right")
     spread = (
-        f"{_number(s['return_mean'])} +- {_number(s['return_sd'])}"
+        f"{number(s['return_mean'])} +- {number(s['return_sd'])}"
         for s in columns.values()
     )
     shown.add_row("return, mean +- sd", *spread)
-    own_rows = [(name.replace("_", " "), f"{name}_mean", 1.0) for name in own]
-    for label, key, factor in (*MEASURES, *own_rows):
-        if all(key in summary for summary in columns.values()):
-            cells = (escape(_cell(s, key, factor)) for s in columns.values())
-            shown.add_row(escape(label), *cells)
+    for metric in (RETURN, LENGTH, *metrics.values()):
+        for statistic in metric.table:
+            cells = [_cell(s, metric, statistic) for s in columns.values()]
+            if all(cells):
+                shown.add_row(
+                    escape(_row_label(metric, statistic)), *map(escape, cells)
+                )
     return shown
 
 
-def _cell(summary: Summary, key: str, factor: float) -> str:
-    """A value, with its interval where it has one."""
-    text, bounds = _number(factor * summary[key]), summary.get(f"{key}_ci95")
+def _row_label(metric: Metric, statistic: Statistic) -> str:
+    """For instance `collision [%]`, `clearance [mm]`, `clearance, min [mm]`."""
+    unit = "%" if statistic == "rate" else metric.shown_unit
+    word = f", {statistic}" if statistic in ("min", "max") else ""
+    return f"{metric.label}{word}" + (f" [{unit}]" if unit else "")
+
+
+def _cell(summary: Summary, metric: Metric, statistic: Statistic) -> str:
+    """A value, with its interval where it has one; empty where there is none."""
+    key = f"{metric.name}_{statistic}"
+    if key not in summary:
+        return ""
+    factor = 100.0 if statistic == "rate" else metric.factor
+    text, bounds = number(factor * summary[key]), summary.get(f"{key}_ci95")
     if bounds:
-        text += f" [{', '.join(_number(factor * bound) for bound in bounds)}]"
+        text += f" [{', '.join(number(factor * bound) for bound in bounds)}]"
     return text
-
-
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
 def save(
     results: Mapping[str, Episodes],
-    reductions: Mapping[str, str],
+    metrics: Mapping[str, Metric],
     about: Mapping[str, Any],
     folder: Path,
     title: str,
@@ -107,7 +98,7 @@ def save(
     Args:
         results: Values of each episode by engine. The first one's summary is the
             file's, a second one stands under `reference`.
-        reductions: How the environment's metrics fold.
+        metrics: The environment's metrics.
         about: What was evaluated, and how.
         folder: Where the files go.
         title: Heading of the plots.
@@ -117,7 +108,7 @@ def save(
     """
     folder.mkdir(parents=True, exist_ok=True)
     columns = {
-        name: {**summarise(values, reductions), "engine": name}
+        name: {**summarise(values, metrics), "engine": name}
         for name, values in results.items()
     }
     own, *others = columns.values()
@@ -130,8 +121,8 @@ def save(
     ]
     pl.concat(rows).write_parquet(folder / run_folder.EPISODES)
     for metric, plot, name in (
-        ("contact_force_peak", figures.plot_forces, run_folder.FORCES),
-        ("clearance", figures.plot_clearances, run_folder.CLEARANCES),
+        ("contact_force_peak", histograms.plot_forces, run_folder.FORCES),
+        ("clearance", histograms.plot_clearances, run_folder.CLEARANCES),
     ):
         found = {k: values[metric] for k, values in results.items() if metric in values}
         if found:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +22,7 @@ DPI = 120
 NICE = (1, 2, 2.5, 5, 10)
 """Multiples at which an axis may have its numbers."""
 
-_RC = {
+_RC: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
@@ -114,11 +116,11 @@ def finish(axis: Axes, title: str, last: float) -> None:
     axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x, last)))
     axis.yaxis.set_major_locator(MaxNLocator(5, steps=NICE))
     axis.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.6g}"))
-    values = [y for line in axis.lines for y in line.get_ydata()]
-    if not values:
+    values = np.concatenate([[], *(np.asarray(x.get_ydata()) for x in axis.lines)])
+    if not len(values):
         axis.set_yticks([])
         say(axis, "no episode has finished")
-    elif min(values) >= 0.0:
+    elif values.min() >= 0.0:
         axis.set_ylim(bottom=0.0)
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
+from rmp_mjx.metric import Metric, reductions
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.learning import episodes, faults
 from rmp_mjx.trees import cast_like, select
@@ -48,8 +49,8 @@ class Env(Protocol):
         ...
 
     @property
-    def metric_reductions(self) -> Mapping[str, str]:
-        """How each per-step metric folds into an episode's value."""
+    def metrics(self) -> Mapping[str, Metric]:
+        """What a state's metrics are, by name."""
         ...
 
     def reset(self, rng: PRNGKeyArray) -> Any:
@@ -155,7 +156,7 @@ def init(env: Env, keys: Key[Array, " b"], staggered: bool = False) -> RolloutSt
     keys_start, keys_age = split(keys)
     env_state = jax.vmap(env.reset)(keys_start)
     env_state = cast_like(env_state, env_state)
-    fold = episodes.start(env.metric_reductions, keys.shape)
+    fold = episodes.start(reductions(env.metrics), keys.shape)
     age = jnp.zeros(keys.shape, jnp.int32)
     if staggered:
         draw = partial(jax.random.randint, shape=(), minval=0)
@@ -172,7 +173,7 @@ def split(keys: Key[Array, " b"]) -> tuple[Key[Array, " b"], Key[Array, " b"]]:
 
 def init_stats(env: Env, num_envs: int) -> RolloutStats:
     """Sums before the first step."""
-    kinds = env.metric_reductions
+    kinds = reductions(env.metrics)
     zero, none = jnp.zeros(num_envs, jnp.float32), jnp.zeros(num_envs, jnp.int32)
     return RolloutStats(
         episodes=none,
@@ -221,7 +222,7 @@ def unroll(
     Returns:
         New state, transitions (T, b) and the statistics of the unroll.
     """
-    kinds = env.metric_reductions
+    kinds = reductions(env.metrics)
 
     def reset_done(done, env_state, keys):
         fresh = jax.vmap(env.reset)(keys)

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import polars as pl
@@ -17,19 +17,10 @@ from rich.progress import (
 )
 
 from rmp_mjx.files import replacing
+from rmp_mjx.metric import RETURN, Metric, number
 from rmp_mjx.training.runs.metrics import Row, of_all_seeds
 from rmp_mjx.training.runs.trackers import Tracker
 
-SHOWN = (
-    ("time/steps_per_s", "steps/s", ".0f"),
-    ("episode/return", "return", ".1f"),
-    ("episode/via_points", "via", ".2f"),
-    ("per_1000_steps/via_points", "via/1k", ".1f"),
-    ("episode/success", "success", ".0%"),
-    ("per_1000_steps/collision", "coll/1k", ".2f"),
-    ("per_1000_steps/joint_limit", "limit/1k", ".2f"),
-)
-"""Column, label and format of what the terminal shows, where a task has it."""
 PLAIN_INTERVAL = 10.0
 """Seconds between lines where the output is not a terminal."""
 WRITE_INTERVAL = 5.0
@@ -46,6 +37,7 @@ class RunLogger:
     def __init__(
         self,
         metrics_path: Path,
+        metrics: Mapping[str, Metric],
         num_iterations: int,
         first_iteration: int = 0,
         console: Console | None = None,
@@ -55,6 +47,8 @@ class RunLogger:
 
         Args:
             metrics_path: Parquet file, rewritten atomically as rows arrive.
+            metrics: The environment's metrics: those with a headline are on the
+                terminal's line.
             num_iterations: Iterations of the whole run.
             first_iteration: Iterations that are done already (a resumed run): the
                 rows up to there are kept, later ones dropped.
@@ -62,6 +56,7 @@ class RunLogger:
             trackers: Where the rows go besides.
         """
         self._path = metrics_path
+        self._headlines = [m for m in (RETURN, *metrics.values()) if m.headline]
         self._console = console or Console()
         self._warned: set[str] = set()
         self._rows = self._read(first_iteration) if first_iteration else []
@@ -167,11 +162,10 @@ class RunLogger:
         return f" eta {left:.0f} s"
 
     def _shown(self) -> str:
-        return " ".join(
-            f"{label} {self._last[name]:{form}}"
-            for name, label, form in SHOWN
-            if self._last.get(name) is not None
-        )
+        """The newest values of what has a headline, after the speed."""
+        found = [(m, self._last.get(m.column)) for m in self._headlines]
+        shown = [headline(m, float(value)) for m, value in found if value is not None]
+        return " ".join([f"steps/s {self._last['time/steps_per_s']:.0f}", *shown])
 
     def flush(self) -> None:
         """Write all rows to the parquet file, replacing it in one move.
@@ -187,6 +181,15 @@ class RunLogger:
                 rows.write_parquet(temporary)
         except (OSError, pl.exceptions.PolarsError) as error:
             self._warn(f"{self._path} cannot be written for now", error)
+
+
+def headline(metric: Metric, value: float) -> str:
+    """A metric on the terminal's line, for instance `success 97%` or `coll/1k 0.50`."""
+    if metric.event:
+        return f"{metric.headline}/1k {value:.2f}"
+    unit = metric.shown_unit
+    unit = unit if unit in ("", "%") else f" {unit}"
+    return f"{metric.headline} {number(metric.factor * value)}{unit}"
 
 
 def _combined(rows: Iterable[Row]) -> Row:

@@ -77,11 +77,11 @@ def train(
     state, first = _start(programs, config, checkpoints, console)
     _announce(env, config, folder, programs.mesh.size, console)
     primary = distributed.is_primary()
-    logger = _open_logger(config, folder, first, console) if primary else None
+    logger = _open_logger(env, config, folder, first, console) if primary else None
     note = logger.note if logger else console.print
     own = checkpoints if primary else None
     saver = Saver(own, folder, note, first, commands)
-    watch = Watch(config, folder, note, commands)
+    watch = Watch(config, env.metrics, folder, note, commands)
     loop = _Loop(config, programs, logger, saver, watch)
     with StopRequest() as stop, logger or nullcontext():
         state, done, stopping = loop.run(state, first, stop)
@@ -188,13 +188,13 @@ def _open_checkpoints(config: TrainConfig, folder: Path) -> Checkpointer | None:
 
 
 def _open_logger(
-    config: TrainConfig, folder: Path, done: int, console: Console
+    env: Env, config: TrainConfig, folder: Path, done: int, console: Console
 ) -> RunLogger:
     """The logger of a new run, or of one that continues after `done` iterations."""
     after = done * config.ppo.steps_per_iteration if config.run.resume else None
     trackers = open_trackers(config, folder, folder / run_folder.TENSORBOARD, after)
     path = folder / run_folder.METRICS
-    return RunLogger(path, config.num_iterations, done, console, trackers)
+    return RunLogger(path, env.metrics, config.num_iterations, done, console, trackers)
 
 
 def _announce(

@@ -1,11 +1,12 @@
-"""Checks of every iteration: non-finite numbers, and contacts that were not read."""
+"""Checks of every iteration: non-finite numbers, and metrics that mean a fault."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from rmp_mjx.metric import Metric
 from rmp_mjx.training.learning import faults, seeds
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import TrainConfig
@@ -25,6 +26,7 @@ class Watch:
     def __init__(
         self,
         config: TrainConfig,
+        metrics: Mapping[str, Metric],
         folder: Path,
         note: Callable[[str], None],
         commands: Commands,
@@ -33,10 +35,12 @@ class Watch:
 
         Args:
             config: Configuration.
+            metrics: The environment's metrics.
             folder: Run folder.
             note: Called with one line for each kind of finding, once.
         """
         self._config = config
+        self._meanings = {m.column: m.fault for m in metrics.values() if m.fault}
         self._folder = folder / run_folder.NONFINITE
         self._note = note
         self._commands = commands
@@ -73,13 +77,9 @@ class Watch:
             rows: Its rows, one for each seed.
             fault: Its faults, fetched only if the rows count any.
         """
-        overflow = max(row.get("episode/contact_overflow") or 0.0 for row in rows)
-        if overflow:
-            self._once(
-                "overflow",
-                "warning: a pair of bodies had more contacts than are read: the forces "
-                "of these episodes are too low (column episode/contact_overflow)",
-            )
+        for column, meaning in self._meanings.items():
+            if any(row.get(column) for row in rows):
+                self._once(column, f"warning: {meaning} (column {column})")
         for k, row in enumerate(rows if fault else ()):
             if row["nonfinite_envs"]:
                 self._dump(row, k, seeds.of_seed(fault, k, self._config.ppo))

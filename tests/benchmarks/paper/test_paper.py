@@ -36,7 +36,7 @@ from benchmarks.paper import (
 from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
 from benchmarks.paper.store import Store
 from envs.cli import make_config
-from envs.types import METRICS
+from envs.measures import METRICS
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import run_folder, saving
@@ -53,10 +53,8 @@ class Arm(Pytree):
     dt: float = struct.field(pytree_node=False, default=0.05)
     episode_length: int = struct.field(pytree_node=False, default=6)
 
-    task_metrics = ()
-
     @property
-    def metric_reductions(self):
+    def metrics(self):
         return METRICS
 
     def _state(self, key, obs, collision, reward):

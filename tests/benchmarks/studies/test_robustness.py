@@ -188,7 +188,7 @@ def test_a_crossing_puts_the_spheres_halfway_beside_the_way(env):
     )
     world, _ = start(case)
     state = jax.tree.map(lambda x: x[0], world.state)
-    grip, target = env.site(state.data).p, state.info["points"][0]
+    grip, target = env.site(state.data).p, state.task["points"][0]
     beside = state.data.mocap_pos - 0.5 * (grip + target)
     # float32 positions of about 0.5 m.
     np.testing.assert_allclose(beside @ (target - grip), 0.0, atol=1e-6)

@@ -58,7 +58,7 @@ def test_agents_with_the_same_key_meet_the_same_tasks(results):
 
 
 def test_the_summary_counts_what_the_episodes_say(results):
-    summary = evaluate.summarise(results, toys.Counter().metric_reductions)
+    summary = evaluate.summarise(results, toys.Counter().metrics)
     hits = int(results["collision"].sum())
     assert summary["episodes"] == EPISODES
     assert summary["return_mean"] == pytest.approx(-hits / EPISODES)

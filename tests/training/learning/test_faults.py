@@ -8,6 +8,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
+from rmp_mjx.metric import Metric, by_name
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import run_folder, watch
@@ -105,17 +106,18 @@ def row(**changes):
     return values | {"episode/contact_overflow": None} | changes
 
 
-def test_contacts_that_were_not_read_are_said_once(tmp_path):
+def test_a_metric_that_means_a_fault_is_said_once(tmp_path):
     notes = []
-    watching = watch.Watch(CONFIG, tmp_path, notes.append, Commands())
+    metrics = by_name([Metric("contact_overflow", "max", fault="forces too low")])
+    watching = watch.Watch(CONFIG, metrics, tmp_path, notes.append, Commands())
     for share in (None, 0.0, 0.25, 0.5):
         watching.report([row(**{"episode/contact_overflow": share})], None)
     (said,) = notes
-    assert "more contacts than are read" in said
+    assert said == "warning: forces too low (column episode/contact_overflow)"
 
 
 def test_training_goes_on_with_some_skipped_updates_and_not_without_any_other(tmp_path):
-    watching = watch.Watch(CONFIG, tmp_path, pytest.fail, Commands())
+    watching = watch.Watch(CONFIG, {}, tmp_path, pytest.fail, Commands())
     updates = CONFIG.ppo.num_updates_per_batch * CONFIG.ppo.num_minibatches
     some, all_of_them = (
         row(**{"learning/skipped_updates": float(n)}) for n in (updates - 1, updates)

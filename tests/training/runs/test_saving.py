@@ -98,7 +98,7 @@ def test_a_full_disk_for_logs_is_said_once_and_loses_no_row(tmp_path, monkeypatc
         raise FULL
 
     console = Console(file=text, width=200)
-    with RunLogger(tmp_path / "m.parquet", 4, console=console) as logger:
+    with RunLogger(tmp_path / "m.parquet", {}, 4, console=console) as logger:
         monkeypatch.setattr(pl.DataFrame, "write_parquet", fail)
         for iteration in (1, 2, 3):
             logger.add({"iteration": iteration, "steps": iteration})

@@ -73,7 +73,7 @@ def log(folder, config, after=None, rows=(ROW,)):
     opened = trackers.open_trackers(config, folder, folder / "tb", after)
     text = io.StringIO()
     console = Console(file=text, width=200)
-    with RunLogger(folder / "m.parquet", 1, 0, console, opened) as logger:
+    with RunLogger(folder / "m.parquet", {}, 1, 0, console, opened) as logger:
         for row in rows:
             logger.add(row)
     return text.getvalue()

@@ -1,0 +1,104 @@
+"""A metric is declared in one place and appears everywhere."""
+
+import dataclasses
+import io
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+import envs
+from envs import measures, safety
+from envs.door import Door, DoorOptions
+from envs.safety import SafetyRecord
+from envs.trajectory import Trajectory, TrajectoryOptions
+from rmp_mjx.metric import Metric
+from rmp_mjx.training.evaluation import report
+from rmp_mjx.training.evaluation.evaluate import run_episodes, summarise
+from rmp_mjx.training.learning.networks import zero_agent
+from rmp_mjx.training.runs.logging import RunLogger
+from tests.envs.arm_tasks import Torques
+
+
+class Measured(Trajectory):
+    """Trajectory following with one more metric."""
+
+    task_metrics = (
+        *Trajectory.task_metrics,
+        Metric("height", "max", unit="m", headline="height", table=("mean", "max")),
+    )
+
+    def score(self, data, site, record, task, step):
+        found = super().score(data, site, record, task, step)
+        return found._replace(metrics=found.metrics | {"height": site.p[2]})
+
+
+@pytest.fixture(scope="module")
+def env():
+    options = TrajectoryOptions(physics="mujoco", episode_length=3)
+    return Measured(options, controller=Torques(jnp.zeros(7)))
+
+
+def test_a_new_metric_is_one_declaration(env, tmp_path):
+    """In the step's metrics, the episodes, the summary, the table, the terminal."""
+    results = run_episodes(env, zero_agent(env.action_size), 2, jax.random.key(0))
+    summary = summarise(results, env.metrics)
+    assert summary["height_max"] == pytest.approx(results["height"].max())
+    text = io.StringIO()
+    console = Console(file=text, width=80)
+    console.print(report.table({"toy": summary}, "title", env.metrics))
+    assert "height [mm]" in text.getvalue() and "height, max [mm]" in text.getvalue()
+    row = {"iteration": 1, "steps": 10, "time/steps_per_s": 1.0, "episode/height": 0.25}
+    with RunLogger(tmp_path / "m.parquet", env.metrics, 1, console=console) as logger:
+        logger.add(row)
+    assert "height 250 mm" in text.getvalue()
+
+
+def test_every_environment_has_the_shared_metrics_and_its_own():
+    for name in envs.names():
+        task = envs.ENVS[name]
+        own = {metric.name for metric in task.task_metrics}
+        assert own and not own & measures.METRICS.keys()
+    assert set(measures.METRICS) > set(safety.METRICS)
+
+
+def test_a_record_folds_each_field_as_it_declares():
+    def record(flag, number):
+        values = {"any": jnp.array(flag), "mean": jnp.array(number)}
+        values["max"] = values["mean"]
+        return SafetyRecord(**{n: values[fold] for n, fold in safety.FOLDS.items()})
+
+    one, two = record(True, 3.0), record(False, 1.0)
+    both = SafetyRecord.empty().then(one, 0.5).then(two, 0.5)
+    expected = {"any": True, "mean": 2.0, "max": 3.0}
+    for field in dataclasses.fields(both):
+        fold = safety.FOLDS[field.name]
+        np.testing.assert_allclose(getattr(both, field.name), expected[fold])
+    assert both.events.keys() | both.values.keys() == safety.METRICS.keys()
+    assert not both.events.keys() & both.values.keys()
+
+
+def test_what_a_wrapper_adds_to_the_info_is_not_the_tasks(env):
+    """It passes through a step; the task sees its own part alone."""
+    seen = []
+
+    class Spy(Door):
+        def score(self, data, site, record, task, step):
+            seen.append(set(task))
+            return super().score(data, site, record, task, step)
+
+    spy = Spy(DoorOptions(physics="mujoco"), controller=Torques(jnp.zeros(7)))
+    start = jax.eval_shape(spy.reset, jax.random.key(0))
+    assert set(start.info) == {"rng", "step", "spheres", "active_events", "task"}
+
+    def stepped(key):
+        state = spy.reset(key)
+        state = state.replace(info=state.info | {"steps": jnp.int32(7)})
+        return spy.step(state, jnp.zeros(spy.action_size))
+
+    after = jax.eval_shape(stepped, jax.random.key(0))
+    assert seen == [{"held", "grip_force"}]
+    assert set(after.info) == set(start.info) | {"steps"}
+    assert set(after.task) == set(start.task)
