@@ -68,9 +68,9 @@ def psd_solve(
 def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     r"""Lower factor $L$ of a small positive definite $A = L L^T$, unrolled.
 
-    It calls no LAPACK: a batch vectorises under `jax.vmap`. jaxlib 0.10's batched LAPACK
-    calls wait for the thread pool that runs them, and can wait for ever where several CPU
-    devices do so at once.
+    It calls no LAPACK, so a batch vectorises under `jax.vmap`. The batched LAPACK calls
+    of jaxlib 0.10 wait for the thread pool that runs them, and can wait for ever if
+    several CPU devices do so at once.
 
     Args:
         A: Symmetric positive definite matrix, (n, n). Only the lower triangle is read.
@@ -87,8 +87,8 @@ def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def solve_lower(
-    L: Float[Array, "n n"], b: Float[Array, n *k], transposed: bool = False
-) -> Float[Array, n *k]:
+    L: Float[Array, "n n"], b: Float[Array, " n *k"], transposed: bool = False
+) -> Float[Array, " n *k"]:
     """Solve ``L x = b``, or ``L^T x = b``, for a small lower triangular L, unrolled.
 
     Args:

@@ -42,7 +42,7 @@ class Gap(NamedTuple):
     curvature: Array
     """The part of the distance's acceleration that is not normal . xdd [m/s^2]."""
     active: Array
-    """Whether the control point has to keep off."""
+    """Whether the control point avoids the obstacle."""
 
 
 class Shape(Pytree, abc.ABC):
@@ -60,7 +60,7 @@ class Shape(Pytree, abc.ABC):
         """Distance of every control point to every obstacle; see `Obstacles.gaps`."""
 
     def _avoided(self, hand: Bool[np.ndarray, " p"]) -> Bool[Array, "o p"]:
-        """Which control points keep off which obstacles."""
+        """Which control points avoid which obstacles."""
         exempt = self.hand_may_touch[:, None] & hand
         return jnp.asarray(self.active)[:, None] & ~exempt
 

@@ -52,4 +52,4 @@ class ControlOutput(Pytree):
     """Metric of the root RMP (natural form), without the regulariser."""
     diagnostics: dict[str, Any]
     """Scalars by name. Every controller has `torque_scale` in [0, 1] (1 = no
-    saturation); the others are said by the controller."""
+    saturation). The controller documents the others."""

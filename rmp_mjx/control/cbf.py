@@ -24,12 +24,12 @@ from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.vec import Vec
 
 LARGEST = 300.0
-"""Change that a barrier may ask for at most [sqrt(kg m^2) rad/s^2]."""
+"""Largest change that one barrier can demand [sqrt(kg m^2) rad/s^2]."""
 KEPT = 48
-"""Constraints of the program: those with the least room. The others are looked at after
-it is solved."""
+"""Constraints of the program: those with the least room. The others are checked after
+the solution."""
 FREE = 1e-3
-"""Rows shorter than this are left out: the joints cannot move that distance."""
+"""Rows shorter than this are left out: no joint changes that distance."""
 
 
 class Barriers(NamedTuple):
@@ -44,11 +44,11 @@ class Barriers(NamedTuple):
     rows: Float[Array, "m n"]
     """Its gradient."""
     active: Bool[Array, " m"]
-    """Whether it counts."""
+    """Whether the barrier is in use."""
 
 
 class FilteredVICES(VICES):
-    r"""The acceleration that VICES' torques give, changed as little as safety needs.
+    r"""VICES with the smallest change of its acceleration that keeps the barriers.
 
     $$
     \min_{\ddot q} \|\ddot q - \ddot q_{VICES}\|^2_{M_q}
@@ -60,9 +60,9 @@ class FilteredVICES(VICES):
     with a barrier on the distance of every control point to every obstacle, of the
     links' capsules to each other, and of every joint to its limits: the same points,
     obstacles and margins as `RMPVICES`. They have relative degree 2; the gains put both
-    poles at $-\alpha$, so that a distance decays without overshoot. Where not all
-    can hold, each is violated at a cost that grows with its square (see `project`),
-    and the torque is clipped in the end.
+    poles at $-\alpha$, so that a distance decays without overshoot. If not all can
+    hold, a violation costs its square (see `project`). The torque is clipped in the
+    end.
 
     Source: Nguyen and Sreenath, "Exponential control barrier functions" (2016); Khazoom
     et al., "Humanoid self-collision avoidance using whole-body control with control
@@ -72,9 +72,9 @@ class FilteredVICES(VICES):
     rate: Float[Constant, ""] | float = 10.0
     """Rate alpha at which a distance may shrink [1/s]."""
     margin: Float[Constant, ""] | float = 0.005
-    """Distance that is kept [m]."""
+    """Minimum distance [m]."""
     limit_margin: Float[Constant, ""] | float = 0.12
-    """Room that is kept to a joint's limit [rad]."""
+    """Minimum distance to a joint limit [rad]."""
     penalty: Float[Constant, ""] | float = 1e3
     """Cost of a squared violation over that of a squared change."""
 
@@ -118,7 +118,7 @@ class FilteredVICES(VICES):
         qd: Float[Array, " n"],
         obstacles: Obstacles,
     ) -> Barriers:
-        """All distances beyond their margins, where the arm is in state q, qd."""
+        """All distances beyond their margins, in the state q, qd."""
         kinds = [_points(self.robot, arm, obstacles), _links(self.robot, arm)]
         found = [_beyond(kind, self.margin) for kind in kinds if kind is not None]
         found.append(_beyond(_joints(self.robot, q, qd), self.limit_margin))

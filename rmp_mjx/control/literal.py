@@ -9,9 +9,9 @@ from rmp_mjx.rmp.leaves.joint_limit import RMPflowJointLimit
 from rmp_mjx.robot.model import Robot
 
 REGULARIZER = 1e-5
-"""The root's epsilon: at 4,000 random states, singular ones and such beside obstacles
-among them, 99 % of the float32 accelerations are within 20 % of float64's (90 % within
-6 %); at 1e-6 a tenth of them are wrong by most of their size."""
+"""The root's epsilon. At 4,000 random states, some singular and some close to
+obstacles, 99 % of the float32 accelerations are within 20 % of float64's (90 % within
+6 %). At 1e-6 a tenth of them are wrong by most of their size."""
 
 
 def rmp_vices_literal(robot: Robot) -> RMPVICES:
@@ -20,17 +20,17 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
     The two impedance attractors (metric 1, never relaxed), its collision leaf
     $m = \max(-\dot x, 0)^2 / x^4, \; a = -\eta \dot x$, and RMPflow's joint
     limiter at its authors' values. No posture leaf, no self-collision leaf, no
-    curvature, floor, margin or range. It is here to be compared with: nothing in it
-    resists a slow push, at rest its joint limiter weighs 0.01 everywhere, and its null
-    space is undamped.
+    curvature, floor, margin or range. It is a baseline: nothing in it resists a slow
+    push, at rest the metric of its joint limiter is 0.01 everywhere, and its null space
+    is undamped.
 
     What cannot be literal, and why:
 
     * Signs: as printed the attractor repels, the collision leaf acts on leaving and
       accelerates. The leaf's output is the force $f = m a$ that a pullback adds.
     * The root: $\ddot q = M^+ f$ jumps where the rank of M changes and in float32
-      drops the attractors beside an obstacle. Instead `RMPVICES`' resolve with the
-      least power of ten that float32 can do with (`REGULARIZER`).
+      drops the attractors beside an obstacle. Instead we use the resolve of `RMPVICES`
+      with the least power of ten that works in float32 (`REGULARIZER`).
     * $x^{-4}$ has no value at contact: x is clamped at 5 mm and the metric at
       1e5, the number in the authors' related code.
     * $\eta$ and the control points were not published: 2/s, from the range in

@@ -13,8 +13,8 @@ from rmp_mjx.types import Action
 class OSC(VICES):
     """VICES whose policy moves the set-point only.
 
-    The stiffness entries of an action are ignored; actions keep their size, so that a
-    policy fits either. The stiffness is that of robosuite's OSC_POSE controller.
+    The stiffness entries of an action are ignored. Actions keep their size, so that the
+    same policy network fits. The stiffness is that of robosuite's OSC_POSE controller.
     """
 
     kp: Float[Constant, ""] | float = 150.0

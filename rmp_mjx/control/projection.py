@@ -1,4 +1,4 @@
-"""The point of soft half-spaces that is nearest to the origin, in batches."""
+"""The point nearest to the origin in soft half-spaces, in batches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rmp_mjx.math import psd_solve
 STEPS = tuple(0.5**k for k in range(8))
 """Trial lengths of a Newton step."""
 TOLERANCE, ITERATIONS = 3e-3, 20
-"""Step at which the solver stops, in the units of x, and when it gives up."""
+"""Step length at which the solver stops, in units of x, and its iteration limit."""
 
 
 def project(

@@ -15,8 +15,8 @@ def scale_torque(
     \tau = b + k\, M_q \ddot q, \quad k \in [0, 1] \text{ as large as fits.}
     $$
 
-    Clipping each joint by itself would turn the acceleration away from what the tree
-    asked for, into an obstacle if it must be. A bias beyond the limits is clipped.
+    Clipping each joint separately would change the direction of the acceleration,
+    perhaps into an obstacle. A bias beyond the limits is clipped.
 
     Args:
         dynamic: Mq qdd, (n,) [N m].
@@ -37,10 +37,10 @@ def scale_torque(
 def clip_torque(
     tau: Float[Array, " n"], tau_max: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Clip each joint by itself, as VICES and robosuite do.
+    """Clip each joint separately, as VICES and robosuite do.
 
     Returns:
-        Torque (n,) [N m] and the least fraction of a joint's demand that is met.
+        Torque (n,) [N m] and the least fraction of a demanded torque that is met.
     """
     clipped = jnp.clip(tau, -tau_max, tau_max)
     size = jnp.abs(tau)

@@ -14,7 +14,7 @@ _HIGHEST = "highest"
 class RMP(Pytree):
     """A Riemannian Motion Policy ``(f, M)`` in natural form on an n-dimensional space.
 
-    The acceleration it asks for is any solution of ``M a = f``.
+    Its desired acceleration is any solution of ``M a = f``.
     """
 
     f: Float[Array, " n"]

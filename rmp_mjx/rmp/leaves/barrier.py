@@ -47,11 +47,11 @@ class Barrier(ScalarLeaf):
     x_min: Param = 5e-3
     """Clamp of the distance to the margin, [unit], > 0."""
     cap: Param = 1e3
-    """Largest metric."""
+    """Largest metric, which bounds the condition of the root."""
     k_out: Param = 100.0
     """Outward stiffness inside the margin, [1/s^2]."""
     v_out: Param = 3e-3
-    """Speed over which a leaving body is let go, [unit/s], > 0."""
+    """Release speed: the metric fades over it while the body leaves, [unit/s], > 0."""
 
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]

@@ -14,7 +14,7 @@ from rmp_mjx.rmp.leaves.barrier import Barrier
 
 
 def joint_limit_barrier() -> Barrier:
-    """The verified barrier for joint limits; distances in rad (or m)."""
+    """The default barrier for joint limits; distances in rad (or m)."""
     return Barrier(mu=2.5e-3, eps=0.2, eta=40.0, r=0.2, margin=0.14, cap=1e3, k_out=2e3)
 
 
