@@ -269,8 +269,8 @@ def _protocol(place: Store, preset: Preset) -> list[Block]:
         Heading("Protocol"),
         Text(
             "All variants train with the same settings, listed below. The leaf "
-            "parameters of RMP-VICES were chosen before, mostly with policies that had learned "
-            "nothing. For door and push, the collision leaves of the spheres were "
+            "parameters of RMP-VICES were chosen before, mostly with policies that had "
+            "learned nothing. For door and push, the collision leaves of the spheres were "
             "chosen with trained policies, on 400 of the close layouts below. VICES "
             "has its authors' gains. The safety filter has the control points and "
             "obstacles of the tree and a margin of 5 mm. Neither was tuned here. As in "

@@ -23,7 +23,9 @@ PANELS = 3
 def split_curves(groups: Sequence[Group]) -> tuple[list[str], list[str]]:
     """Columns to draw, `FIRST` first, and those that have the same value throughout."""
     rows = [group.rows for group in groups]
-    names = dict.fromkeys(name for each in rows for name in (*FIRST, *curves.columns(each)))
+    names = dict.fromkeys(
+        name for each in rows for name in (*FIRST, *curves.columns(each))
+    )
     moving, flat = [], []
     for name in names:
         found = [each[name].drop_nulls() for each in rows if name in each.columns]
