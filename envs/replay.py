@@ -68,7 +68,7 @@ def policy_step(
     Yields:
         The start, the set-point, the parts of every physics step, and the result.
     """
-    asked, n, info = env.options, env.robot.n, state.info
+    options, n, info = env.options, env.robot.n, state.info
     data, spheres = state.data, info["spheres"]
     yield Moment("before", {"action": np.asarray(action), **_motion(data)})
 
@@ -79,14 +79,14 @@ def policy_step(
     yield Moment("set-point", {k: np.asarray(v) for k, v in vars(setpoint).items()})
 
     _, key = jax.random.split(info["rng"])
-    error = asked.obstacle_noise * jax.random.normal(key, (env.scene.spheres, 3))
+    error = options.obstacle_noise * jax.random.normal(key, (env.scene.spheres, 3))
 
     @jax.jit
     def control(data, spheres):
         seen = env.obstacles(data, spheres, error)
         out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, seen)
         centers = data.mocap_pos
-        if asked.obstacle_speed and env.scene.spheres:
+        if options.obstacle_speed and env.scene.spheres:
             centers, spheres = spheres.move(centers, env.sim_dt, *env.sphere_box)
         return out, centers, spheres
 

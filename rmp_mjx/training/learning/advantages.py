@@ -36,17 +36,17 @@ def generalised_advantages(
         `values`.
     """
     delta = data.reward + discounting * (1.0 - data.termination) * next_values - values
-    going_on = (1.0 - data.termination) * (1.0 - data.truncation)
+    continues = (1.0 - data.termination) * (1.0 - data.truncation)
 
     def backward(later, step):
-        delta, going_on, weight = step
-        advantage = weight * (delta + discounting * gae_lambda * going_on * later)
+        delta, continues, weight = step
+        advantage = weight * (delta + discounting * gae_lambda * continues * later)
         return advantage, advantage
 
     _, advantages = jax.lax.scan(
         backward,
         jnp.zeros_like(values[0]),
-        (delta, going_on, data.weight),
+        (delta, continues, data.weight),
         reverse=True,
     )
     return advantages

@@ -1,8 +1,8 @@
-"""Environments spread over devices, the networks on every one of them.
+"""Environments spread over devices; every device has the networks.
 
-A mesh has one axis, `AXIS`, along which whatever has a row for each environment is cut.
-Roll-outs run apart on each piece (`per_device`); the rest is one program over all of
-the data, which the compiler divides, gradients summed up included.
+A mesh has one axis, `AXIS`. Arrays with a row for each environment are split along it.
+Roll-outs run separately on each device (`per_device`). The rest is one program over all
+of the data, which the compiler divides, sums of gradients included.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ def make_mesh(groups: int, wanted: int | None = None) -> Mesh:
     """A mesh of the devices that share the groups of environments equally.
 
     Args:
-        groups: Groups of environments; their number is a multiple of the devices'.
+        groups: Number of groups of environments; every device gets as many.
         wanted: At most this many devices; None: all.
 
     Returns:
@@ -41,7 +41,7 @@ def make_mesh(groups: int, wanted: int | None = None) -> Mesh:
 
 
 def local_mesh(groups: int) -> Mesh:
-    """As `make_mesh`, of this process's devices alone."""
+    """As `make_mesh`, with the devices of this process only."""
     devices = jax.local_devices()
     return Mesh(np.array(devices[: _shares(groups, len(devices))]), (AXIS,))
 
@@ -52,28 +52,28 @@ def _shares(groups: int, most: int) -> int:
 
 
 def spec(axis: int | None) -> PartitionSpec:
-    """Cut along an array's `axis`; None: whole on every device."""
+    """Split along an array's `axis`; None: a copy on every device."""
     return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
 
 
 def placed(mesh: Mesh, axis: int | None) -> NamedSharding:
-    """How an array lies on the mesh: cut along `axis`, or (None) whole everywhere."""
+    """Placement of an array on the mesh; see `spec`."""
     return NamedSharding(mesh, spec(axis))
 
 
 def per_device(
     function: Callable[..., Any], mesh: Mesh, in_axes: Any, out_axes: Any
 ) -> Callable[..., Any]:
-    """Run a function on each device, on its own rows alone.
+    """Run a function on each device, with the rows of that device.
 
-    The compiler cannot divide what it cannot see into, such as a simulator behind a
-    host callback; this divides by hand.
+    The compiler cannot divide a simulator behind a host callback; this does.
 
     Args:
-        function: Takes and returns trees of arrays; it treats rows alike and apart.
+        function: Takes and returns trees of arrays; it must process each row
+            independently.
         mesh: The devices.
-        in_axes: For each argument, the axis of its rows; None where it has none. A
-            tree may stand in for all of its leaves.
+        in_axes: For each argument, the axis of its rows; None if it has none. One
+            axis may stand for all leaves of a tree.
         out_axes: The same for the results.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Steps that became non-finite: noted on the device, written to files for a replay."""
+"""Steps that became non-finite: kept on the device, written to files for a replay."""
 
 import json
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ from rmp_mjx.pytree import Pytree
 from rmp_mjx.trees import like, named_leaves, numbers
 
 ACTION, ABOUT = "action", "about"
-"""Entries of a file besides the leaves of the state."""
+"""Entries of a file in addition to the leaves of the state."""
 
 
 class Fault(Pytree):
     """The first step of each environment in an unroll that became non-finite."""
 
     happened: Bool[Array, "*b"]
-    """Whether there was one; the rest means nothing where there was none."""
+    """Whether there was one; if not, the other fields mean nothing."""
     env_state: Any
-    """The environments' states before it."""
+    """States of the environments before it."""
     action: Float[Array, "*b m"]
     """The actions that led to it."""
 
@@ -46,7 +46,7 @@ def dump(
         fault: Faults, (b,).
         folder: Where the files go; it is made.
         name: Beginning of their names.
-        about: What the reader needs besides, JSON-ready; the lane is added.
+        about: Further information for the reader, JSON-ready; the lane is added.
         most: At most this many files.
 
     Returns:
@@ -92,10 +92,10 @@ def load(path: Path, template: Any) -> tuple[Any, Float[np.ndarray, " m"]]:
 
 
 def about(path: Path) -> dict[str, Any]:
-    """What a file says about where it comes from.
+    """The information that `dump` stored in a file.
 
     Raises:
-        ValueError: It is no file of `dump`.
+        ValueError: The file was not written by `dump`.
     """
     try:
         with np.load(path) as stored:

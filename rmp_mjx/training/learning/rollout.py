@@ -1,8 +1,8 @@
 """Batched rollouts: time limit, full resets, exact episode statistics.
 
-Every environment has a random stream of its own and nothing here looks across the
-batch, so that a batch may be cut into pieces, one a device, without any change. The
-one exception is a short cut: resets are skipped in steps where nobody needs one.
+Every environment has its own random stream and does not depend on the others. So a
+batch may be split over devices without changing any result. One shortcut looks at the
+whole batch: a step in which no environment ends computes no reset.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ VALUE_LIMIT = 1e6
 """Observations or rewards beyond this magnitude count as non-finite."""
 
 NONFINITE = "nonfinite"
-"""Metric by which an environment says that it has become non-finite."""
+"""Metric by which an environment reports that it has become non-finite."""
 
 
 class Env(Protocol):
@@ -63,7 +63,7 @@ class Env(Protocol):
 
 
 class RolloutState(Pytree):
-    """Where a batch of environments stands; carried from one unroll to the next."""
+    """State of a batch of environments, carried from one unroll to the next."""
 
     env_state: Any
     """Environment states, batched."""
@@ -91,22 +91,49 @@ class Transition(Pytree):
     termination: Float[Array, "*b"]
     """1 where the task ended the episode: no value follows."""
     truncation: Float[Array, "*b"]
-    """1 where only the time limit ended it: the next value still counts."""
+    """1 where only the time limit ended it: the next value is bootstrapped."""
     weight: Float[Array, "*b"]
-    """0 where the simulation became non-finite: the step is left out."""
+    """0 where the simulation became non-finite: the step is excluded."""
 
 
 class RolloutStats(Pytree):
     """Sums over the steps and the finished episodes of an unroll, by environment."""
 
     episodes: Int[Array, "*b"]
-    """Finished episodes, those lost to a non-finite state not included."""
+    """Finished episodes, except those lost to a non-finite state."""
     episode_sums: dict[str, Float[Array, "*b"]]
     """Sum over them of `return`, `length` and every metric."""
     step_sums: dict[str, Float[Array, "*b"]]
     """Sum over all steps of every metric that is a sum (events)."""
     nonfinite: Int[Array, "*b"]
     """Steps that became non-finite."""
+
+    def add(
+        self,
+        finished: Bool[Array, "*b"],
+        values: Mapping[str, Float[Array, "*b"]],
+        metrics: Mapping[str, Float[Array, "*b"]],
+        finite: Bool[Array, "*b"],
+    ) -> "RolloutStats":
+        """Add a step.
+
+        Args:
+            finished: Whether it ended an episode that counts.
+            values: Values of the episodes so far.
+            metrics: Metrics of the step.
+            finite: Whether it stayed finite.
+        """
+        return RolloutStats(
+            episodes=self.episodes + finished.astype(jnp.int32),
+            episode_sums={
+                name: sums + jnp.where(finished, values[name], 0.0)
+                for name, sums in self.episode_sums.items()
+            },
+            step_sums={
+                name: sums + metrics[name] for name, sums in self.step_sums.items()
+            },
+            nonfinite=self.nonfinite + (~finite).astype(jnp.int32),
+        )
 
 
 Act = Callable[
@@ -120,7 +147,7 @@ def finite_step(
 ) -> tuple[Any, Bool[Array, " b"]]:
     """Step every environment; a non-finite one ends, with reward and metrics 0.
 
-    An environment may find out by itself and report it as its metric `nonfinite`.
+    An environment may also report it itself, by its metric `nonfinite`.
 
     Returns:
         The new states and a mask of those that are finite. The observation of the
@@ -148,10 +175,10 @@ def init(env: Env, keys: Key[Array, " b"], staggered: bool = False) -> RolloutSt
     Args:
         env: The environment.
         keys: Randomness of each start.
-        staggered: Cut the first episodes off at random times, so that a batch of
-            transitions shows all phases of an episode rather than one. A cut is a
-            truncation: the value beyond it still counts. The statistics of finished
-            episodes leave out those that only this cut ended.
+        staggered: Truncate the first episodes at random times, so that a batch of
+            transitions has all phases of an episode rather than one. The value after
+            a truncation is bootstrapped. The statistics of finished episodes leave
+            out those that only this truncation ended.
     """
     keys_start, keys_age = split(keys)
     env_state = jax.vmap(env.reset)(keys_start)
@@ -166,7 +193,7 @@ def init(env: Env, keys: Key[Array, " b"], staggered: bool = False) -> RolloutSt
 
 
 def split(keys: Key[Array, " b"]) -> tuple[Key[Array, " b"], Key[Array, " b"]]:
-    """Two streams of each environment's one."""
+    """Two random streams for each environment from one."""
     pairs = jax.vmap(jax.random.split)(keys)
     return pairs[:, 0], pairs[:, 1]
 
@@ -190,10 +217,10 @@ def total(stats: RolloutStats) -> RolloutStats:
 
 @jax.custom_batching.custom_vmap
 def _anyone(mask: Bool[Array, " b"]) -> Bool[Array, ""]:
-    """Whether a mask holds anywhere, in any lane of an outer vmap too.
+    """Whether a mask holds anywhere, also in any lane of an outer vmap.
 
-    A `cond` on it stays a branch under vmap, where it would otherwise become a
-    select that always pays for both sides.
+    A `cond` on it stays a branch under vmap. With `mask.any()` it would become a
+    select, which always computes both sides.
     """
     return mask.any()
 
@@ -209,13 +236,13 @@ def unroll(
 ) -> tuple[RolloutState, Transition, RolloutStats]:
     """Let a policy act for some steps in every environment.
 
-    An environment that ends is reset anew (`env.reset` with a fresh key).
+    An environment that ends is reset with a new key.
 
     Args:
         env: The environment.
         act: Batched policy: (observations, a key for each) -> (actions, extras), the
             extras with `raw_action` and `log_prob`.
-        state: Where the environments stand.
+        state: State of the environments.
         keys: Randomness of each environment's actions and resets.
         length: Number of steps T.
 
@@ -244,17 +271,7 @@ def unroll(
         done = termination | (age >= env.episode_length)
         finished = done & finite & (termination | (age == fold.length))
         values = episodes.finish(fold, kinds)
-        stats = RolloutStats(
-            episodes=stats.episodes + finished.astype(jnp.int32),
-            episode_sums={
-                name: sums + jnp.where(finished, values[name], 0.0)
-                for name, sums in stats.episode_sums.items()
-            },
-            step_sums={
-                name: sums + new.metrics[name] for name, sums in stats.step_sums.items()
-            },
-            nonfinite=stats.nonfinite + (~finite).astype(jnp.int32),
-        )
+        stats = stats.add(finished, values, new.metrics, finite)
         transition = Transition(
             obs=obs,
             next_obs=new.obs,

@@ -1,6 +1,6 @@
-"""Several agents in one program: seeds are one more axis of everything.
+"""Several agents in one program: every array has one more axis, that of the seeds.
 
-With one seed the axis is not there: nothing differs from training a single agent.
+With one seed there is no such axis: the program is that of a single agent.
 """
 
 import dataclasses
@@ -33,11 +33,11 @@ class Programs(NamedTuple):
     learn: Callable[[TrainState, Any], Any]
     """`PPO.learn`; consumes the state."""
     place: Callable[[TrainState], TrainState]
-    """Spread a state over the devices, every array in a buffer of its own."""
+    """Copy a state onto the devices, every array into its own buffer."""
 
 
 def keys(config: PPOConfig) -> Key[Array, "*k"]:
-    """The keys that the agents start from: one key, or (num_seeds,)."""
+    """Keys from which the agents start: one key, or (num_seeds,)."""
     if config.num_seeds == 1:
         return jax.random.key(config.seed)
     return jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
