@@ -49,6 +49,7 @@ class World(Task[OptionsT]):
             controller: A controller object instead of the options' named one.
         """
         self.options = options
+        self._own = {"arm": robot is not None, "controller": controller is not None}
         self.robot = self._jaco() if robot is None else robot
         self.controller = self._named_controller() if controller is None else controller
         self.scene = build_scene(
@@ -76,6 +77,19 @@ class World(Task[OptionsT]):
             default = controller.leaves == Leaves.default(self.robot)
             return controller.with_collision(collision) if default else controller
         return controller
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What the options do not say: the arm, and a controller that is an object.
+
+        Runs record it. The Jaco 2 is as in the library: its rotor inertias are an
+        option, and its posture is the task's.
+        """
+        arm = self.robot if self._own["arm"] else Robot.load("jaco2")
+        found = {"arm": f"'{arm.name}' (fingerprint {arm.fingerprint[:12]})"}
+        if self._own["controller"]:
+            found["controller"] = f"'{type(self.controller).__name__}' of your own"
+        return found
 
     @property
     def engine(self) -> str:

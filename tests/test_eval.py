@@ -73,6 +73,21 @@ def test_options_of_the_task_override_the_runs(evaluate, asked, tmp_path):
     assert asked == [wanted]
 
 
+def test_a_run_of_another_arm_is_refused_and_its_evaluation_kept(
+    evaluate, tmp_path, capsys
+):
+    folder = tmp_path / "run"
+    run(folder)
+    path = folder / "config.json"
+    record = json.loads(path.read_text()) | {"environment": {"arm": "'panda' (ab12)"}}
+    path.write_text(json.dumps(record))
+    (folder / "eval.json").write_text("kept")
+    assert evaluate(["--run", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert "was trained with the arm 'panda' (ab12), not with" in said
+    assert (folder / "eval.json").read_text() == "kept"
+
+
 def test_a_second_engine_gives_a_second_column(evaluate, asked, tmp_path, capsys):
     options = ["--agent", "zero", "--env", "counter", "--out", str(tmp_path)]
     options += ["--episodes", "5", "--physics", "mujoco", "--no-video"]

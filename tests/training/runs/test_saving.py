@@ -97,11 +97,12 @@ def test_a_full_disk_for_logs_is_said_once_and_loses_no_row(tmp_path, monkeypatc
     def fail(*args):
         raise FULL
 
+    row = {"time/steps_per_s": 1.0}
     console = Console(file=text, width=200)
     with RunLogger(tmp_path / "m.parquet", {}, 4, console=console) as logger:
         monkeypatch.setattr(pl.DataFrame, "write_parquet", fail)
         for iteration in (1, 2, 3):
-            logger.add({"iteration": iteration, "steps": iteration})
+            logger.add(row | {"iteration": iteration, "steps": iteration})
             logger.flush()
         monkeypatch.setattr(pl.DataFrame, "write_parquet", write)
         logger.add({"iteration": 4, "steps": 4})
