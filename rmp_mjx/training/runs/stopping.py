@@ -23,6 +23,11 @@ class StopRequest:
         self.signal: int | None = None
         self._previous: dict[int, object] = {}
 
+    @property
+    def exit_code(self) -> int:
+        """128 plus the signal's number, as shells report it; 0 without a signal."""
+        return 128 + self.signal if self.signal else 0
+
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.signal = number
         for each in self._previous:
