@@ -16,6 +16,7 @@ from rich.console import Console
 from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer, SaveError
 from rmp_mjx.training.runs.logging import RunLogger
+from rmp_mjx.training.runs.metrics import Row
 from rmp_mjx.training.runs.saving import Saver
 from rmp_mjx.training.runs.stopping import TrainingFailure
 
@@ -97,7 +98,7 @@ def test_a_full_disk_for_logs_is_said_once_and_loses_no_row(tmp_path, monkeypatc
     def fail(*args):
         raise FULL
 
-    row = {"time/steps_per_s": 1.0}
+    row: Row = {"time/steps_per_s": 1.0}
     console = Console(file=text, width=200)
     with RunLogger(tmp_path / "m.parquet", {}, 4, console=console) as logger:
         monkeypatch.setattr(pl.DataFrame, "write_parquet", fail)
