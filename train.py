@@ -22,7 +22,7 @@ from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs import distributed, metrics, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
 from rmp_mjx.training.runs.commands import Commands
-from rmp_mjx.training.runs.loop import TrainingFailure, train
+from rmp_mjx.training.runs.loop import TrainingFailure, TrainResult, train
 
 COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.replay")
 """What messages of a run tell its user to type."""
@@ -82,6 +82,15 @@ def evaluate_seeds(
         film.publish(partial(render, env), tapes[0], env.dt, folder, console)
 
 
+def _train(env, config: TrainConfig, folder, console: Console) -> TrainResult:
+    """Train with the trainer that the configuration names."""
+    if config.trainer == "ours":
+        return train(env, config, folder, console, COMMANDS)
+    from rmp_mjx.training.brax import trainer  # loads all of Brax's environments
+
+    return trainer.train(env, config, folder, console)
+
+
 def run(config: TrainConfig, console: Console) -> int:
     """Train and evaluate one configuration; returns the exit code."""
     try:
@@ -93,7 +102,7 @@ def run(config: TrainConfig, console: Console) -> int:
         runtime.configure(split_cpu=distributed.alone())
         env = envs.make(config.task)
         try:
-            result = train(env, config, folder, console, COMMANDS)
+            result = _train(env, config, folder, console)
         except (CheckpointError, TrainingFailure, ConfigError) as error:
             print(f"error: {error}", file=sys.stderr)
             return 2 if isinstance(error, ConfigError) else 1

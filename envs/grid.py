@@ -45,9 +45,10 @@ class Grid:
         }
 
     def _cell(self, env: str, controller: str) -> TrainConfig:
-        folder = self.folder / f"{env}-{controller}"
-        begun = (folder / run_folder.CONFIG).exists()
-        return self.configs[env].replace(
+        folder, config = self.folder / f"{env}-{controller}", self.configs[env]
+        can_resume = config.trainer == "ours"
+        begun = can_resume and (folder / run_folder.CONFIG).exists()
+        return config.replace(
             controller=controller,
             run_dir=None if begun else str(folder),
             resume=str(folder) if begun else None,

@@ -9,6 +9,8 @@ import polars as pl
 import pytest
 
 import train
+from envs import grid
+from rmp_mjx.training.config import TrainConfig
 from tests import toy_task
 from tests.training.conftest import SMALL
 
@@ -53,6 +55,30 @@ def test_a_run_trains_evaluates_and_plots(toy, tmp_path):
     assert train.main([*OPTIONS, "--run_dir", str(folder)]) == 2  # not empty
     assert train.main(["--resume", str(folder)]) == 0  # nothing left to do
     assert toy[-1].variant == "heavy"
+
+
+def test_braxs_trainer_leaves_the_same_results_and_is_not_resumed(
+    toy, tmp_path, capsys
+):
+    folder = tmp_path / "run"
+    options = ["--trainer", "brax", "--run_dir", str(folder)]
+    assert train.main([*OPTIONS, *options]) == 0
+    found = json.loads((folder / "eval.json").read_text())
+    assert found["episodes"] == SMALL["eval_episodes"]
+    assert (folder / "learning_curve.png").stat().st_size > 0
+    with pytest.raises(SystemExit, match="2"):
+        train.main(["--resume", str(folder)])
+    assert "brax cannot resume" in capsys.readouterr().err
+
+
+def test_an_interrupted_cell_of_braxs_trainer_begins_anew(tmp_path):
+    config = TrainConfig(toy_task.CounterOptions(), trainer="brax")
+    cells = grid.Grid(tmp_path, {"counter": config}, ("vices",))
+    cell = tmp_path / "counter-vices"
+    cell.mkdir()
+    (cell / "config.json").write_text("{}")
+    run = cells.cells()["counter-vices"].run
+    assert (run.resume, run.run_dir, run.overwrite) == (None, str(cell), True)
 
 
 def test_several_seeds_leave_a_result_each_and_one_of_all(toy, tmp_path):

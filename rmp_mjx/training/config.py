@@ -89,6 +89,8 @@ class PPOConfig:
     """Hidden layers of the policy and of the value network (tanh)."""
     init_log_std: float = -0.5
     """Initial log standard deviation of the policy's actions."""
+    reward_scaling: float = 1e-3
+    """Factor on the rewards, for trainer brax: ours scales value targets by itself."""
 
     def __post_init__(self):
         """Check the values.
@@ -111,6 +113,7 @@ class PPOConfig:
             "value_learning_rate",
             "clipping_epsilon",
             "max_grad_norm",
+            "reward_scaling",
         )
         _not_negative(self, "entropy_cost", "vf_coefficient", "target_kl", "seed")
         for name in ("discounting", "gae_lambda"):
@@ -219,8 +222,10 @@ class TrainConfig(Generic[AnyTask]):
     run: RunConfig = RunConfig()
     """The run."""
     trainer: Literal["ours", "brax"] = "ours"
-    """Who trains: ours, or brax (Brax's own PPO), which cannot resume, train several
-    seeds in one program, or repeat a run exactly on another number of devices."""
+    """Who trains: ours, or brax (Brax's own PPO). brax cannot resume a run, train
+    several seeds in one program or in several processes, or repeat a run exactly on
+    another number of devices. It has no value_learning_rate and no num_groups; its
+    learning rate follows target_kl."""
 
     def __post_init__(self):
         """Check what the parts ask for together.
@@ -232,6 +237,12 @@ class TrainConfig(Generic[AnyTask]):
             raise ConfigError("trainer brax cannot resume a run")
         if self.trainer == "brax" and self.ppo.num_seeds > 1:
             raise ConfigError("trainer brax trains one seed: leave num_seeds out")
+        if self.trainer == "brax" and self.ppo.num_envs % self.ppo.num_minibatches:
+            raise ConfigError(
+                "trainer brax divides environments into minibatches: num_envs = "
+                f"{self.ppo.num_envs} is no multiple of num_minibatches = "
+                f"{self.ppo.num_minibatches}"
+            )
 
     @property
     def num_iterations(self) -> int:

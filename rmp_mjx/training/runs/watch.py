@@ -57,7 +57,7 @@ class Watch:
         updates = config.num_updates_per_batch * config.num_minibatches
         for row in rows:
             lost = int(row["nonfinite_envs"] or 0)
-            skipped = int(row["learning/skipped_updates"] or 0)
+            skipped = int(row.get("learning/skipped_updates") or 0)
             if lost > MAX_LOST_FRACTION * config.steps_per_iteration:
                 cause = (
                     f"{lost} of {config.steps_per_iteration} steps became non-finite"
