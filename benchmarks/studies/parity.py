@@ -1,22 +1,25 @@
-"""Our PPO loop beside Brax's own, on the same task with the same sizes.
+"""Our PPO loop beside Brax's own, on the same tasks, both tuned with the same budget.
 
-`python -m benchmarks.parity --json F --plot P`. Brax 0.14.2 trains with jax up to 0.9
-only: run it in an environment of that kind. Both meet the same environments, policy
-steps, unrolls, minibatches and passes, and are evaluated with sampled actions over
-fresh episodes at the same numbers of policy steps. What differs is each loop's own:
-Brax has one optimiser for both networks, squashes actions by tanh and returns to an
-episode's first state; ours has two optimisers, clips, scales value targets, and resets
-anew.
+`python -m benchmarks.parity --json F --plot P`. Both loops are what `train.py` runs
+with `--trainer ours` and `--trainer brax`: the same networks, environments, iterations,
+passes and minibatches. Each has four trials: two learning rates of the policy, times
+two values of what the value function needs, which is a learning rate of its own with us
+and a factor on the rewards with Brax. Brax has one learning rate; in one trial it
+follows the KL divergence, in the other it is larger and fixed. The trials have a seed
+of their own; the seeds that are reported are trained afterwards. Policies are judged at
+equal distances, by their mean actions, on the same starts.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
+import itertools
 import json
+import statistics
 import sys
-import time
+import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,40 +27,46 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.agents.ppo import networks as brax_networks
-from brax.training.agents.ppo import train as brax_ppo
+import polars as pl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from rich.console import Console
 
 import envs
 from benchmarks.common import machine
-from envs.brax import BraxTask
 from envs.types import State
 from rmp_mjx import runtime
-from rmp_mjx.metric import Metric
-from rmp_mjx.training.config import PPOConfig
+from rmp_mjx.training.brax import trainer
+from rmp_mjx.training.config import PPOConfig, RunConfig, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
-from rmp_mjx.training.learning.networks import make_agent
-from rmp_mjx.training.learning.ppo import make_ppo
+from rmp_mjx.training.runs import loop, run_folder
 from rmp_mjx.training.stats import bootstrap_curve, bootstrap_mean, interquartile_mean
 
+TASKS = ("reach", "trajectory")
+"""Tasks that the loops can be compared on."""
 LOOPS = {"ours": "#2a6fbb", "brax": "#c0504d"}
 """The two loops and their colours."""
-SIZES = {
-    "num_envs": 64,
-    "unroll_length": 16,
-    "num_minibatches": 4,
-    "num_updates_per_batch": 4,
-    "discounting": 0.97,
-    "gae_lambda": 0.95,
-    "learning_rate": 3e-4,
-    "clipping_epsilon": 0.2,
+TRAIN = {"ours": loop.train, "brax": trainer.train}
+"""What trains."""
+SIZES: dict[str, Any] = {"num_envs": 128}
+"""What both loops are given besides the defaults of `train.py`."""
+RATES: dict[str, tuple[dict[str, float], ...]] = {
+    "ours": ({"learning_rate": 3e-4}, {"learning_rate": 1e-3}),
+    "brax": ({"learning_rate": 3e-4}, {"learning_rate": 1e-3, "target_kl": 0.0}),
 }
-"""What both loops are given."""
-EVAL_ENVS = 64
+"""Learning rates that are tried."""
+VALUES: dict[str, tuple[str, dict[str, tuple[float, ...]]]] = {
+    "ours": (
+        "value_learning_rate",
+        {"reach": (1e-3, 3e-3), "trajectory": (1e-3, 3e-3)},
+    ),
+    "brax": ("reward_scaling", {"reach": (1.0, 0.1), "trajectory": (1e-3, 1e-2)}),
+}
+"""What else is tried, and its values by task: rewards are about 1 and about 30."""
+TUNING_SEED = 100
+"""Seed of the trials; those reported are 0, 1, ..."""
+EVAL_EPISODES = 64
 """Episodes of each evaluation."""
-HIDDEN = (64, 64)
-"""Hidden layers of each network."""
 
 
 class Reach:
@@ -65,7 +74,7 @@ class Reach:
 
     observation_size, action_size = 4, 2
     dt, episode_length = 0.05, 50
-    metrics = {"distance": Metric("distance", "last", unit="m")}  # noqa: RUF012
+    metric_reductions = {"distance": "last"}  # noqa: RUF012
     options = SimpleNamespace(physics="none")
 
     def reset(self, rng):
@@ -90,89 +99,128 @@ class Reach:
         )
 
 
+@dataclass(frozen=True)
+class ReachOptions:
+    """What the record of a run on `Reach` says."""
+
+    title: str = "reach"
+    """The task's name."""
+
+    def record(self) -> dict[str, Any]:
+        """There are no options."""
+        return {"env": self.title}
+
+
+Judge = Callable[[Any], float]
+"""Mean return of an agent's episodes."""
 Curve = list[tuple[int, float]]
 """Policy steps and mean return of an episode."""
 
 
-def train_ours(task: Any, steps: int, points: int, seed: int) -> Curve:
-    """Our loop, evaluated as often as Brax's."""
-    config = PPOConfig(
-        seed=seed,
-        hidden_sizes=HIDDEN,
-        value_learning_rate=SIZES["learning_rate"],
-        target_kl=0.0,
-        **SIZES,
-    )
-    ppo = make_ppo(task, config)
-    state = jax.jit(ppo.init)(jax.random.key(seed))
-    iterate = jax.jit(ppo.iterate, donate_argnums=0)
+@dataclass(frozen=True)
+class Run:
+    """One training."""
 
-    episodes = evaluate.recorder(task, EVAL_ENVS, 0)
-
-    def mean_return(state, key):
-        agent = make_agent(ppo.networks, state.normalizer, state.learner.policy, False)
-        return float(episodes(agent, key)[0]["return"].mean())
-
-    iterations = -(-steps // config.steps_per_iteration)
-    curve, each = [], iterations // (points - 1)
-    for done in range(iterations + 1):
-        if done % each == 0:
-            found = mean_return(state, jax.random.key(1000 * seed + done))
-            curve.append((done * config.steps_per_iteration, found))
-        if done < iterations:
-            state, _, _ = iterate(state)
-    return curve
+    curve: Curve
+    """Its evaluations."""
+    steps_per_s: float
+    """Policy steps a second: the median over the iterations after the first two."""
 
 
-def train_brax(task: Any, steps: int, points: int, seed: int) -> Curve:
-    """Brax's loop."""
-    curve: Curve = []
-    brax_ppo.train(
-        environment=BraxTask(task),
-        num_timesteps=steps,
-        num_evals=points,
-        num_eval_envs=EVAL_ENVS,
-        episode_length=task.episode_length,
-        num_envs=SIZES["num_envs"],
-        unroll_length=SIZES["unroll_length"],
-        batch_size=SIZES["num_envs"] // SIZES["num_minibatches"],
-        num_minibatches=SIZES["num_minibatches"],
-        num_updates_per_batch=SIZES["num_updates_per_batch"],
-        discounting=SIZES["discounting"],
-        gae_lambda=SIZES["gae_lambda"],
-        learning_rate=SIZES["learning_rate"],
-        clipping_epsilon=SIZES["clipping_epsilon"],
-        entropy_cost=0.0,
-        normalize_observations=True,
-        seed=seed,
-        progress_fn=lambda n, m: curve.append((n, float(m["eval/episode_reward"]))),
-        network_factory=functools.partial(
-            brax_networks.make_ppo_networks,
-            policy_hidden_layer_sizes=HIDDEN,
-            value_hidden_layer_sizes=HIDDEN,
-        ),
-    )
-    return curve
+def load(name: str) -> tuple[Any, Any]:
+    """A task, and what its configuration says of it.
+
+    Trajectory following is run with VICES and episodes of 256 steps: a fifth of the
+    time of the usual ones.
+    """
+    if name == "reach":
+        return Reach(), ReachOptions()
+    task = envs.load(name, controller="vices", episode_length=256)
+    return task, task.options
 
 
-TRAINERS: dict[str, Callable[[Any, int, int, int], Curve]] = {
-    "ours": train_ours,
-    "brax": train_brax,
-}
+def train(
+    which: str, task: Any, options: Any, judge: Judge, points: int, **given: Any
+) -> Run:
+    """Train with one of the loops and judge the policies that it saves on the way."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = TrainConfig(options, PPOConfig(), RunConfig(), trainer=which)
+        config = config.replace(**SIZES, **given, run_dir=folder)
+        each = config.num_iterations // points
+        config = config.replace(checkpoint_interval=each, keep_every=each)
+        _, lock = run_folder.open_run(config)
+        with lock:
+            TRAIN[which](task, config, Path(folder), Console(quiet=True))
+        curve = []
+        for done in range(each, config.num_iterations + 1, each):
+            _, agent = loop.load_agent(
+                task, config, Path(folder), True, print, checkpoint=str(done)
+            )
+            curve.append((done * config.ppo.steps_per_iteration, judge(agent)))
+        rows = pl.read_parquet(Path(folder) / run_folder.METRICS)
+    return Run(curve, statistics.median(rows["time/steps_per_s"].to_list()[2:]))
 
 
-def summary(curves: Sequence[Curve]) -> dict[str, Any]:
-    """Over the seeds: the curve with its interval, the last return, the mean of all."""
-    values = np.array([[value for _, value in curve] for curve in curves])
+def trials(which: str, task: str) -> list[dict[str, float]]:
+    """The settings that a loop is tried with: every rate with every value."""
+    name, values = VALUES[which]
+    return [
+        {**rate, name: value}
+        for rate, value in itertools.product(RATES[which], values[task])
+    ]
+
+
+def compare(name: str, steps: int, seeds: int, points: int) -> dict[str, Any]:
+    """Tune both loops on a task and train them with every seed."""
+    task, options = load(name)
+    size = SIZES["num_envs"] * PPOConfig().unroll_length * points
+    steps = -(-steps // size) * size  # evaluations fall on the same steps
+    recorded = evaluate.recorder(task, EVAL_EPISODES, 0)
+
+    def judge(agent):
+        return float(recorded(agent, jax.random.key(1000))[0]["return"].mean())
+
+    found: dict[str, Any] = {"seeds": seeds}
+    for which in LOOPS:
+        tried = []
+        for setting in trials(which, name):
+            given = {"num_timesteps": steps, "seed": TUNING_SEED, **setting}
+            run = train(which, task, options, judge, 1, **given)
+            tried.append({**setting, "return": run.curve[-1][1]})
+            print(f"{name}, {which}, tried: {tried[-1]}", flush=True)
+        best = max(tried, key=lambda trial: trial["return"])
+        chosen = {key: value for key, value in best.items() if key != "return"}
+        runs = [
+            train(
+                which,
+                task,
+                options,
+                judge,
+                points,
+                num_timesteps=steps,
+                seed=seed,
+                **chosen,
+            )
+            for seed in range(seeds)
+        ]
+        found[which] = {"trials": tried, "chosen": chosen, **summary(runs)}
+        last, low, high = found[which]["last"]
+        print(f"{name}, {which}: last return {last:.4g} [{low:.4g}, {high:.4g}]")
+    return found
+
+
+def summary(runs: Sequence[Run]) -> dict[str, Any]:
+    """Over the seeds: the curve with its interval, the last return, the speed."""
+    values = np.array([[value for _, value in run.curve] for run in runs])
     low, high = bootstrap_curve(values)
-    last, area = values[:, -1], values.mean(axis=1)
+    last = values[:, -1]
     return {
-        "steps": [step for step, _ in curves[0]],
+        "steps": [step for step, _ in runs[0].curve],
         "return": interquartile_mean(values).tolist(),
         "low": low.tolist(),
         "high": high.tolist(),
         "last": [float(last.mean()), *bootstrap_mean(last)],
-        "mean_over_training": [float(area.mean()), *bootstrap_mean(area)],
+        "steps_per_s": statistics.median(run.steps_per_s for run in runs),
     }
 
 
@@ -182,11 +230,11 @@ def plot(results: dict[str, dict[str, Any]], path: Path) -> None:
     FigureCanvasAgg(figure)
     axes = np.atleast_1d(figure.subplots(1, len(results)))
     for axis, (task, found) in zip(axes, results.items(), strict=True):
-        for loop, color in LOOPS.items():
-            curve = found[loop]
+        for which, color in LOOPS.items():
+            curve = found[which]
             x = np.array(curve["steps"]) / 1e3
             axis.fill_between(x, curve["low"], curve["high"], color=color, alpha=0.2)
-            axis.plot(x, curve["return"], color=color, lw=1.4, label=loop)
+            axis.plot(x, curve["return"], color=color, lw=1.4, label=which)
         axis.set_title(f"{task}, {found['seeds']} seeds", fontsize=9)
         axis.set_xlabel("policy steps [thousands]", fontsize=9)
         axis.set_ylabel("return of an episode", fontsize=9)
@@ -197,36 +245,22 @@ def plot(results: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Train both loops with every seed, write figure and JSON; the exit code."""
+    """Compare the loops on each task, write figure and JSON; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--tasks", nargs="+", default=["reach"], help="`reach` or a task"
-    )
-    parser.add_argument("--steps", type=int, nargs="+", default=[200_000])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[5])
-    parser.add_argument("--points", type=int, default=11)
+    parser.add_argument("--tasks", nargs="+", default=TASKS, choices=TASKS)
+    parser.add_argument("--steps", type=int, nargs="+", default=[60_000, 120_000])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[3, 3])
+    parser.add_argument("--points", type=int, default=5, help="evaluations of a run")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args(args)
-    if not hasattr(jax, "device_put_replicated"):
-        print(f"error: Brax needs jax 0.9, this is {jax.__version__}", file=sys.stderr)
-        return 2
-    runtime.configure()
-    results: dict[str, dict[str, Any]] = {}
-    for name, steps, count in zip(
-        options.tasks, options.steps, options.seeds, strict=True
-    ):
-        task = Reach() if name == "reach" else envs.load(name, controller="vices")
-        size = SIZES["num_envs"] * SIZES["unroll_length"] * (options.points - 1)
-        steps = -(-steps // size) * size  # evaluations fall on the same steps
-        found = results[name] = {"seeds": count}
-        for loop, train in TRAINERS.items():
-            began = time.monotonic()
-            curves = [train(task, steps, options.points, k) for k in range(count)]
-            found[loop] = summary(curves)
-            found[loop]["wall_s"] = round(time.monotonic() - began, 1)
-            last, low, high = found[loop]["last"]
-            print(f"{name}, {loop}: last return {last:.4g} [{low:.4g}, {high:.4g}]")
+    runtime.configure(split_cpu=True)
+    results = {
+        name: compare(name, steps, seeds, options.points)
+        for name, steps, seeds in zip(
+            options.tasks, options.steps, options.seeds, strict=True
+        )
+    }
     if options.plot:
         plot(results, options.plot)
     if options.json:
