@@ -36,6 +36,7 @@ import envs
 from benchmarks.common import machine
 from envs.types import State
 from rmp_mjx import runtime
+from rmp_mjx.metric import Metric
 from rmp_mjx.training.brax import trainer
 from rmp_mjx.training.config import PPOConfig, RunConfig, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
@@ -74,7 +75,7 @@ class Reach:
 
     observation_size, action_size = 4, 2
     dt, episode_length = 0.05, 50
-    metric_reductions = {"distance": "last"}  # noqa: RUF012
+    metrics = {"distance": Metric("distance", "last", unit="m")}  # noqa: RUF012
     options = SimpleNamespace(physics="none")
 
     def reset(self, rng):

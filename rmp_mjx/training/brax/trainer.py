@@ -131,7 +131,7 @@ def train(
     given = arguments(env, config)
     kept, place = config.run.checkpoints_kept, folder / run_folder.CHECKPOINTS
     checkpoints = Checkpointer(place, kept, config.run.keep_every)
-    run_folder.describe(folder, config)
+    run_folder.describe(folder, config, env)
     used = run_folder.device(given["max_devices_per_host"])
     console.print(f"training with Brax's PPO on {used}", highlight=False)
     console.print(
@@ -141,6 +141,7 @@ def train(
     )
     logger = RunLogger(
         folder / run_folder.METRICS,
+        env.metrics,
         config.num_iterations,
         0,
         console,
@@ -148,7 +149,7 @@ def train(
     )
     nothing = Commands()  # Brax's trainer neither resumes nor keeps faults
     saver = Saver(checkpoints, folder, logger.note, 0, nothing)
-    watch = Watch(config, folder, logger.note, nothing)
+    watch = Watch(config, env.metrics, folder, logger.note, nothing)
     with StopRequest() as stop, logger:
         iterations = _Iterations(config, logger, saver, watch, stop)
         batch = Batch(env, config.ppo.unroll_length, iterations.report)
