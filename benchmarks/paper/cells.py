@@ -138,6 +138,7 @@ def settings(preset: Preset) -> dict[str, Any]:
     """What all trainings of a preset share, by name."""
     config = preset.training
     values = dataclasses.asdict(config.ppo)
+    del values["reward_scaling"]  # of another trainer
     return values | {"num_timesteps": config.run.num_timesteps}
 
 

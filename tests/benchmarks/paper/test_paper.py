@@ -1,6 +1,7 @@
 """The paper's grid on toy tasks: order, resumption, numbers, pages."""
 
 import dataclasses
+import json
 import os
 import shutil
 import signal
@@ -34,6 +35,7 @@ from benchmarks.paper import (
     work,
 )
 from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
+from benchmarks.paper.columns import COLUMNS
 from benchmarks.paper.store import Store
 from envs.cli import make_config
 from envs.measures import METRICS
@@ -164,6 +166,19 @@ def test_presets_hold_to_the_papers_protocol():
         assert preset.training.ppo.hidden_sizes == (64, 64)
         ours, base = (preset.config(Cell("door", v, 0)) for v in ("rmp_vices", "vices"))
         assert ours.replace(controller="vices") == base
+
+
+def test_the_results_of_the_repository_are_those_of_the_preset(root):
+    """So that `make paper` repeats none of them."""
+    place, preset = Store(root / "docs" / "results" / "store"), PRESETS["cpu"]
+    for about in place.provenance:
+        cell = Cell(about["task"], about["variant"], about["seed"])
+        if about["kind"] == store.TRAINING:
+            wanted = cells.definition(preset, cell)
+        else:
+            column = COLUMNS[about["column"]]
+            wanted = deployment.definition(preset, cell, column)
+        assert about["definition"] == json.loads(json.dumps(wanted)), about
 
 
 @pytest.mark.parametrize(
