@@ -18,7 +18,7 @@ FREE = ("controller", "physics")
 
 
 def rows(options: Options, results: Path = RESULTS) -> pl.DataFrame | None:
-    """Training rows of VICES on a task, told apart by `seed`.
+    """Training rows of VICES on a task, with the column `seed`.
 
     Args:
         options: Options of the task. The baseline ran with the defaults.

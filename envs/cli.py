@@ -44,7 +44,7 @@ def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid |
     With `--resume RUN` the defaults are those that RUN was started with.
 
     Returns:
-        The options, and the grid if one is asked for.
+        The options, and the grid if there is one.
 
     Raises:
         ValueError: RUN is no run folder, or a name or value is none.
@@ -118,7 +118,7 @@ class EvalOptions(Generic[Task]):
 
     @property
     def tasks(self) -> list[Options]:
-        """The task, then, where one is asked for, the one of the second engine."""
+        """The task, then the one of the second engine if there is one."""
         tasks: list[Options] = [self.task]
         if self.physics:
             other = REFERENCE[self.physics] | {"physics": self.physics}

@@ -1,6 +1,6 @@
 """Several runs that differ in task and controller, one after the other.
 
-A grid's folder has a run folder for every cell and `grid.json`: what was asked for, and
+A grid's folder has a run folder for every cell and `grid.json`: the configurations, and
 which cells have finished. A grid that was interrupted goes on where it stopped.
 """
 

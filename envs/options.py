@@ -1,4 +1,4 @@
-"""What a task can be asked for: one dataclass, checked before anything is built."""
+"""Options of a task: one dataclass, checked before anything is built."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ class Options:
     obstacle_speed: float = 0.0
     """Speed of the spheres, each in a random direction [m/s]."""
     obstacle_noise: float = 0.0
-    """Standard deviation of the sphere positions that the controller is told, drawn
+    """Standard deviation of the sphere positions that the controller sees, drawn
     anew at every policy step [m]."""
     obstacle_delay: float = 0.0
-    """Age of the sphere positions that the controller is told [s]."""
+    """Delay of the sphere positions that the controller sees [s]."""
     event_penalty: float = 50.0
     """Cost of a collision or joint-limit event."""
     terminate_on_event: bool = True

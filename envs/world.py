@@ -100,7 +100,7 @@ class World(Task[OptionsT]):
     def obstacles(
         self, data: PhysicsState, spheres: Spheres, error: Array | float = 0.0
     ) -> Obstacles:
-        """Table, fixtures and spheres, as the controller is told of them.
+        """Table, fixtures and spheres, as the controller sees them.
 
         Args:
             data: Physics.

@@ -10,13 +10,13 @@ from pathlib import Path
 def replacing(path: Path) -> Iterator[Path]:
     """Replace a file by what the body writes to the path that it gets.
 
-    Where the body raises, the old file stays and nothing is left beside it.
+    If the body raises, the old file stays and the new one is removed.
 
     Args:
         path: The file; its folder must exist.
 
     Yields:
-        A path beside it, for the new contents.
+        A path in the same folder, for the new contents.
     """
     temporary = path.with_name(f"{path.name}.tmp")
     try:

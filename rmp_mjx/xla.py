@@ -1,4 +1,4 @@
-"""What XLA must be told on a CPU so that small matrices are computed once."""
+"""A hint to XLA on a CPU, so that small matrices are computed once."""
 
 import jax
 import jax.numpy as jnp

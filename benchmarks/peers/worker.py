@@ -36,11 +36,11 @@ def serve(makers: Mapping[str, Callable[[], Measure]], packages: tuple[str, ...]
     answer(versions={name: metadata.version(name) for name in packages})
     ready: dict[str, Measure] = {}
     for line in sys.stdin:
-        asked = json.loads(line)
-        name = asked["name"]
+        request = json.loads(line)
+        name = request["name"]
         if name not in ready:
             ready[name] = makers[name]()
-        answer(value=ready[name](asked["seconds"]))
+        answer(value=ready[name](request["seconds"]))
 
 
 def rate(call: Callable[[], object], units: int) -> Measure:

@@ -82,16 +82,16 @@ def crossing_start(env: ArmEnv, key: Array, case: Crossing) -> tuple[World, Arra
     offset = jnp.where(placed, case.offset, 0.0)[:, None]
     center = 0.5 * (grip + target) + offset * side
     center = jnp.where(placed[:, None], center, jnp.array(spheres.AWAY))
-    told = state.info["spheres"].replace(placed=placed)
+    known = state.info["spheres"].replace(placed=placed)
     state = state.replace(
         data=state.data.replace(mocap_pos=center),
         info=state.info
         | {
             "task": state.task | {"points": jnp.tile(target, (len(points), 1))},
-            "spheres": told,
+            "spheres": known,
         },
     )
-    fits = (jnp.max(length) > 0.24) & (env.clearance(state.data, told) > 0.03)
+    fits = (jnp.max(length) > 0.24) & (env.clearance(state.data, known) > 0.03)
     special = {"noise": 0.0, "delay": 0.0, "torque": case.torque}
     special = {k: jnp.asarray(v, jnp.float32) for k, v in special.items()}
     memory = jnp.zeros(env.action_size)

@@ -55,11 +55,11 @@ class Parameters:
     posture: float = POSTURE.weight
     """Posture: weight."""
     min_weight: float = RELAXATION.min_weight
-    """Relaxation beside obstacles: least weight of the orientation."""
+    """Relaxation near obstacles: least weight of the orientation."""
     near: float = RELAXATION.near
-    """Relaxation beside obstacles: clearance up to which it has that weight [m]."""
+    """Relaxation near obstacles: clearance up to which it has that weight [m]."""
     far: float = RELAXATION.far
-    """Relaxation beside obstacles: clearance at which it begins [m]."""
+    """Relaxation near obstacles: clearance at which it begins [m]."""
     dither: float = rmp.SetpointDither().amplitude
     """Dither of the set-point: amplitude [m]."""
     limit_min_weight: float = LIMIT_RELAXATION.min_weight

@@ -254,7 +254,7 @@ def safety_rows(name: str, policy: str, figures: Figures) -> list[Row]:
         note = f"{count} in {steps} policy steps; 95 % interval {low:.3g}-{high:.3g}"
         rate = 1e3 * count / steps
         rows.append(Row(f"{name}_{policy}_{event}", rate, "1/1000 steps", note))
-    progress = figures["moved"].sum() / figures["asked"].sum()
+    progress = figures["moved"].sum() / figures["commanded"].sum()
     jump, near = figures["torque_jump"], figures["clearance"] < NEAR
     worst = f"policy step's largest; worst of all {jump.max():.3g}"
     turns = figures["turns"][near].sum() / max(near.sum(), 1) / 0.05

@@ -181,12 +181,12 @@ class Study:
 
     def _special(self) -> dict[str, Array]:
         """The settings of each world, (worlds,) each."""
-        env, asked = self.env, self.env.options
+        env, options = self.env, self.env.options
         special = {
             "spheres": lambda g: _or(g.spheres, env.scene.spheres) if g.layout else 0,
-            "speed": lambda g: _or(g.speed, asked.obstacle_speed),
-            "noise": lambda g: _or(g.noise, asked.obstacle_noise),
-            "delay": lambda g: _or(g.delay, asked.obstacle_delay),
+            "speed": lambda g: _or(g.speed, options.obstacle_speed),
+            "noise": lambda g: _or(g.noise, options.obstacle_noise),
+            "delay": lambda g: _or(g.delay, options.obstacle_delay),
             "torque": lambda g: g.torque,
         }
         return {name: jnp.array(self._each(value)) for name, value in special.items()}
@@ -292,11 +292,11 @@ def advance(
     acts = [make().act(world.memory, key, view) for make in policies.values()]
     memory, action = (jnp.stack(column)[policy] for column in zip(*acts, strict=True))
     after = env.step(state, action)
-    asked = env.controller.decode(action).dpos
+    commanded = env.controller.decode(action).dpos
     moved = env.site(after.data).p - site.p
     figures = {
-        "asked": asked @ asked,
-        "moved": moved @ asked,
+        "commanded": commanded @ commanded,
+        "moved": moved @ commanded,
         "speed": jnp.linalg.norm(moved) / env.dt,
         "turns": jnp.sum(state.data.qvel * after.data.qvel < 0),
     }

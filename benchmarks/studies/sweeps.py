@@ -169,7 +169,7 @@ def judge(figures: dict[str, np.ndarray]) -> Outcome:
         steps=figures["collision"].size,
         collisions=count("collision", "self_collision"),
         limits=count("joint_limit"),
-        progress=float(figures["moved"].sum() / figures["asked"].sum()),
+        progress=float(figures["moved"].sum() / figures["commanded"].sum()),
         torque_jump=float(np.quantile(figures["torque_jump"], 0.99)),
         jerk=float(np.quantile(figures["joint_jerk"], 0.99)),
         turns=float(figures["turns"][near].sum() / max(near.sum(), 1) / 0.05),

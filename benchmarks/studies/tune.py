@@ -78,7 +78,7 @@ class Tally:
     """Collisions and self-collisions."""
     limits: int = 0
     """Joint-limit events."""
-    asked: float = 0.0
+    commanded: float = 0.0
     """Squared length of the commanded displacements [m^2]."""
     moved: float = 0.0
     """Progress along them, times their length [m^2]."""
@@ -88,7 +88,7 @@ class Tally:
     @property
     def progress(self) -> float:
         """Way along the commanded displacement in a policy step, as a share of it."""
-        return self.moved / self.asked
+        return self.moved / self.commanded
 
     def add(self, figures: dict[str, np.ndarray]) -> None:
         """Count one group's steps."""
@@ -96,7 +96,7 @@ class Tally:
         self.steps += figures["collision"].size
         self.collisions += int(collisions)
         self.limits += int(figures["joint_limit"].sum())
-        self.asked += float(figures["asked"].sum())
+        self.commanded += float(figures["commanded"].sum())
         self.moved += float(figures["moved"].sum())
         self.jump = max(self.jump, float(figures["torque_jump"].max()))
 

@@ -103,9 +103,9 @@ def _quiet(model: mjx.Model) -> mjx.Model:
     """Do not print if the solver uses all of its iterations; no other engine does."""
     from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
-    told = model.opt._impl.warn_overflow
-    told &= ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
-    quiet: Any = model.tree_replace({"opt._impl.warn_overflow": int(told)})
+    flags = model.opt._impl.warn_overflow
+    flags &= ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
+    quiet: Any = model.tree_replace({"opt._impl.warn_overflow": int(flags)})
     return quiet
 
 

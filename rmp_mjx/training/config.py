@@ -172,7 +172,7 @@ class RunConfig:
     checkpoints_kept: int = 3
     """Newest checkpoints that are kept, besides the best by success, then return."""
     keep_every: int = 0
-    """Checkpoints at multiples of this many iterations are kept for good; 0: none."""
+    """Checkpoints at multiples of this many iterations are never deleted; 0: none."""
     eval_episodes: int = 100
     """Episodes of the final evaluation; 0: none, and no pictures."""
     eval_deterministic: bool = True
@@ -213,7 +213,7 @@ class RunConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(Generic[AnyTask]):
-    """A task, the learning, the run, and the trainer: all that training is told."""
+    """The whole configuration: task, learning, run and trainer."""
 
     task: AnyTask
     """Options of the task."""

@@ -19,7 +19,7 @@ RUN = Stroke(style.RUN, "this run")
 PANELS = 6
 """Panels of the learning curve at most."""
 COLUMNS = 4
-"""Panels beside each other on the page of the rest."""
+"""Panels in a row of the second page."""
 LINE = 150
 """Characters of a line below the panels."""
 
@@ -31,7 +31,7 @@ class Baseline:
     label: str
     """What the legend calls them."""
     rows: pl.DataFrame
-    """Their rows, told apart by `seed`."""
+    """Their rows, with the column `seed`."""
 
 
 def plot_learning_curve(

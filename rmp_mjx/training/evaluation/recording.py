@@ -50,7 +50,7 @@ def store(
     step: Int[Array, " b"],
     wanted: Bool[Array, " b"],
 ) -> Any:
-    """Write states onto the tape; what lies beyond its ends is dropped.
+    """Write states to the tape; states beyond its ends are dropped.
 
     Args:
         tape: The tape.

@@ -80,7 +80,7 @@ class Optimizers:
 
 
 def make_optimizers(config: PPOConfig) -> Optimizers:
-    """The optimizers that a configuration asks for."""
+    """The optimizers of a configuration."""
 
     def adam(rate: float) -> optax.GradientTransformation:
         return optax.chain(

@@ -21,7 +21,7 @@ def figures(steps, worlds, **changes):
     names = (*QUIET, "moved", "torque_jump", "joint_jerk", "turns", "torque_saturation")
     names += ("success", "via_points", "over", "age", "unplaced_obstacles")
     values = {name: np.zeros((steps, worlds)) for name in names}
-    values["asked"] = values["clearance"] = np.ones((steps, worlds))
+    values["commanded"] = values["clearance"] = np.ones((steps, worlds))
     return values | changes
 
 

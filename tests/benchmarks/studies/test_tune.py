@@ -20,7 +20,7 @@ def run(steps_free=10.0, reached=1.0, **tallies):
 
 
 def tally(collisions=0, limits=0, moved=10.0, jump=0.0):
-    return Tally(1000, collisions, limits, asked=100.0, moved=moved, jump=jump)
+    return Tally(1000, collisions, limits, commanded=100.0, moved=moved, jump=jump)
 
 
 def test_the_parameters_start_at_the_default_leaves(robot):
@@ -86,7 +86,7 @@ def test_a_tally_counts_self_collisions_with_collisions():
         "collision": np.array([[1, 0], [0, 1]]),
         "self_collision": np.array([[0, 0], [1, 0]]),
         "joint_limit": np.array([[0, 1], [0, 0]]),
-        "asked": np.full((2, 2), 2.0),
+        "commanded": np.full((2, 2), 2.0),
         "moved": np.full((2, 2), 0.5),
         "torque_jump": np.array([[1.0, 7.0], [3.0, 2.0]]),
     }
