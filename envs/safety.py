@@ -183,7 +183,7 @@ def observe(
         collision=jnp.any(contacts.touching & (scene.hand | scene.arm)),
         arm_collision=jnp.any(contacts.touching & scene.arm),
         obstacle_collision=jnp.any(contacts.touching & scene.obstacle),
-        self_collision=jnp.any(contacts.touching & scene.own),
+        self_collision=jnp.any(contacts.touching & scene.self_pairs),
         joint_limit=jnp.any(near_lower | near_upper),
         turn_limit=jnp.any(free & (jnp.abs(q) > TURN - LIMIT_MARGIN)),
         contact_force=jnp.sum(unwanted),

@@ -48,7 +48,7 @@ class Scene(Pytree):
     """Pairs of any other link with geoms outside the arm."""
     obstacle: np.ndarray = struct.field(pytree_node=False)
     """Pairs of hand or arm with a sphere."""
-    own: np.ndarray = struct.field(pytree_node=False)
+    self_pairs: np.ndarray = struct.field(pytree_node=False)
     """Pairs of two links of the arm."""
     work: np.ndarray = struct.field(pytree_node=False)
     """Pairs of the hand with geoms that it may touch."""
@@ -101,27 +101,27 @@ def build_scene(
     forbidden += [(g, k, x) for x in contacts.fixtures for g, k in moving]
     forbidden += [(g, k, x) for x in contacts.work for g, k in moving if k < last]
     on_spheres = [(g, k, x) for x in balls for g, k in moving]
-    own = [(links[a][0], links[b][0]) for a, b in capsules.pairs]
+    self_pairs = [(links[a][0], links[b][0]) for a, b in capsules.pairs]
     work = [(g, x) for x in contacts.work for g, k in moving if k == last]
 
     world = forbidden + on_spheres
-    add_pairs(spec, [(g, x) for g, _, x in world] + own)
+    add_pairs(spec, [(g, x) for g, _, x in world] + self_pairs)
     add_pairs(spec, work, friction=contacts.work_friction)
     for a, b, friction in contacts.passive:
         add_pairs(spec, [(a, b)], friction=friction, watched=False)
 
     of_hand = np.array([k == last for _, k, _ in world], bool)
-    groups = [len(forbidden), len(on_spheres), len(own), len(work)]
-    is_forbidden, is_sphere, is_own, is_work = (
+    groups = [len(forbidden), len(on_spheres), len(self_pairs), len(work)]
+    is_forbidden, is_sphere, is_self, is_work = (
         np.repeat(np.arange(4), groups) == i for i in range(4)
     )
-    hand = np.concatenate([of_hand, np.zeros(len(own) + len(work), bool)])
+    hand = np.concatenate([of_hand, np.zeros(len(self_pairs) + len(work), bool)])
     return Scene(
         model=spec.compile(),
         hand=hand,
         arm=(is_forbidden | is_sphere) & ~hand,
         obstacle=is_sphere,
-        own=is_own,
+        self_pairs=is_self,
         work=is_work,
         spheres=spheres,
     )

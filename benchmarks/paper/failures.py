@@ -70,7 +70,7 @@ def _met(env: ArmEnv, data: mujoco.MjData, state: Any, kind: str) -> dict[str, A
     if model.nmocap:
         data.mocap_pos[:] = np.asarray(state.data.mocap_pos)
     mujoco.mj_kinematics(model, data)
-    concerned = scene.own if kind == "self_collision" else scene.hand | scene.arm
+    concerned = scene.self_pairs if kind == "self_collision" else scene.hand | scene.arm
     sensors = np.array(pair_sensors(model))[concerned]
     pairs = [(model.sensor_objid[s], model.sensor_refid[s]) for s in sensors]
     gaps = [mujoco.mj_geomDistance(model, data, a, b, REACH, None) for a, b in pairs]

@@ -24,7 +24,7 @@ class Torques(Pytree):
 
     def __call__(self, q, qd, setpoint, obstacles):
         push = jnp.concatenate([setpoint.kp_pos, setpoint.kp_ori, jnp.zeros(1)])
-        tau = self.hold + push
+        tau = jnp.asarray(self.hold) + push
         return ControlOutput(
             tau=tau,
             qdd=tau,

@@ -1,13 +1,13 @@
 """Names and options that do not exist are refused before anything compiles."""
 
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 import envs
 from envs.door import VARIANTS, DoorOptions
-from envs.options import substeps
+from envs.options import CONTROLLERS, Options, substeps
 from envs.placement import LAYOUTS
 from rmp_mjx import RMPVICES, sim
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near
@@ -44,8 +44,8 @@ def test_a_wrong_option_is_refused_with_the_valid_ones(options, message):
 
 
 def test_the_names_that_options_take_are_the_names_that_exist():
-    kind = get_type_hints(envs.options.Options)
-    assert get_args(kind["controller"]) == tuple(envs.options.CONTROLLERS)
+    kind = get_type_hints(Options)
+    assert get_args(kind["controller"]) == tuple(CONTROLLERS)
     assert get_args(kind["physics"]) == sim.NAMES
     assert get_args(kind["layout"]) == tuple(LAYOUTS)
     assert get_args(get_type_hints(DoorOptions)["variant"]) == tuple(VARIANTS)
@@ -83,27 +83,36 @@ def test_only_the_watched_pairs_can_collide():
     for link in links:
         assert (f"{link}/table" in pairs) == (link != "arm/link_1")
         assert f"{link}/sphere_0" in pairs and f"{link}/sphere_1" in pairs
-    assert np.all(scene.hand.astype(int) + scene.arm + scene.own + scene.work == 1)
+    assert np.all(
+        scene.hand.astype(int) + scene.arm + scene.self_pairs + scene.work == 1
+    )
     assert np.sum(scene.hand) == 2 * 3  # hand and fingers, with table and two spheres
+
+
+def collision_of(env) -> Any:
+    """The collision leaves of a task's controller."""
+    assert isinstance(env.controller, RMPVICES)
+    return env.controller.leaves.collision
 
 
 @pytest.mark.parametrize("task", ["door", "push"])
 def test_where_the_hand_works_the_tree_keeps_further_off_spheres(task):
     """The default leaf elsewhere, for controllers of one's own, and for the others."""
     env = envs.load(task, physics="mujoco")
-    near, leaves = collision_near(), env.collision_leaves(env.robot)
-    assert env.controller.leaves.collision["spheres"] == leaves["spheres"]
+    near = collision_near()
+    leaves: Any = env.collision_leaves(env.robot)
+    assert collision_of(env)["spheres"] == leaves["spheres"]
     assert leaves["spheres"].margin > near.margin
-    assert env.controller.leaves.collision["planes"] == near
+    assert collision_of(env)["planes"] == near
     own = RMPVICES(env.robot)
     assert envs.load(task, physics="mujoco", controller=own).controller is own
     literal = envs.load(task, physics="mujoco", controller="rmp_vices_literal")
-    assert isinstance(literal.controller.leaves.collision, PaperCollision)
+    assert isinstance(collision_of(literal), PaperCollision)
 
 
 def test_the_hand_may_come_nearer_to_the_doors_panel_than_the_other_links():
     env = envs.load("door", physics="mujoco")
-    margin = np.asarray(env.controller.leaves.collision["boxes"].margin)
+    margin = np.asarray(collision_of(env)["boxes"].margin)
     hand = np.array(env.robot.points.segment) == env.robot.n - 1
     assert (margin[hand] == np.float32(0.005)).all()
     assert (margin[~hand] == np.float32(0.015)).all()

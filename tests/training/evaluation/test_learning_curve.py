@@ -19,7 +19,7 @@ METRICS = by_name(
 )
 
 
-def rows(collisions=0.5, size=10, count=20, **more):
+def rows(collisions=0.5, size=10, count=20):
     """A run of `count` iterations; it collides ever less."""
     k = np.arange(1, count + 1)
     return pl.DataFrame(
@@ -37,7 +37,6 @@ def rows(collisions=0.5, size=10, count=20, **more):
             "per_1000_steps/grazing": 0.0 * k,
             "learning/kl": 0.01 + 0 * k,
         }
-        | more
     )
 
 
@@ -135,9 +134,13 @@ def test_bands_and_axes_of_what_is_never_negative_begin_at_zero(drawn):
 
 def test_a_run_without_a_finished_episode_says_so(drawn):
     none = pl.Series([None] * 20, dtype=pl.Float64)
-    empty = {n: none for n in rows().columns if n.startswith("episode/")}
-    empty["episode/finished"] = pl.Series([0] * 20)
-    _, axes = drawn(learning_curve.plot_learning_curve, rows(**empty))
+    empty = rows().with_columns(
+        none.alias(n) for n in rows().columns if n.startswith("episode/")
+    )
+    _, axes = drawn(
+        learning_curve.plot_learning_curve,
+        empty.with_columns(pl.lit(0).alias("episode/finished")),
+    )
     assert [t.get_text() for t in axes["Return"].texts] == ["no episode has finished"]
     assert not axes["Collision events per 1,000 steps"].texts
 
