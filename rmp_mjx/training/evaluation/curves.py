@@ -78,9 +78,9 @@ def is_zero(values: pl.Series) -> bool:
 
 
 def window(rows: pl.DataFrame) -> int:
-    """Policy steps that the running mean of a run covers."""
+    """Policy steps that the running mean of a run covers: three rows at least."""
     iteration = steps_per_row(rows)
-    return iteration * max(1, round(WINDOW * last_step(rows) / iteration))
+    return iteration * max(3, round(WINDOW * last_step(rows) / iteration))
 
 
 def last_step(rows: pl.DataFrame) -> int:

@@ -20,6 +20,8 @@ COLORS = (style.RUN, style.OTHER)
 """One for each engine."""
 SIZE = (6.5, 3.6)
 """Width and height of a histogram [inches]."""
+HEADROOM = 1.3
+"""Height of the axis over that of the highest bar: room for the legend."""
 
 
 def plot_forces(
@@ -68,17 +70,17 @@ def plot_clearances(
         for name, x, color in zip(clearances, values, COLORS, strict=False):
             label = f"{name}: median {np.median(x):.0f} mm, least {np.min(x):.1f} mm"
             axis.hist(x, bins, alpha=0.6, color=color, label=label)
-        axis.axvline(0.0, color=style.INK, lw=1.0)
+        axis.axvline(0.0, ymax=1.0 / HEADROOM, color=style.INK, lw=1.0)
         axis.set_title("Least clearance of an episode [mm]; 0 is contact")
         _finish(axis)
         style.heading(figure, title)
 
 
 def _finish(axis: Axes) -> None:
-    """Whole numbers of episodes, and room for the legend."""
+    """Give the axis whole numbers of episodes, and room for the legend."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_ylabel("episodes")
     axis.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axis.set_ylim(0.0, 1.3 * max(1.0, axis.get_ylim()[1]))
+    axis.set_ylim(0.0, HEADROOM * max(1.0, axis.get_ylim()[1]))
     axis.legend(loc="upper left")
