@@ -112,7 +112,7 @@ def test_a_folder_that_is_no_run_is_refused(runs, tmp_path, capsys):
 
 
 def test_a_run_of_the_last_version_is_read(tmp_path):
-    old = Path(__file__).parent / "training" / "config-0.1.json"
+    old = Path(__file__).parent / "envs" / "config-0.1.json"
     (tmp_path / run_folder.CONFIG).write_text(old.read_text())
     flat, found = json.loads(old.read_text()), read_config(tmp_path)
     assert found.ppo.num_envs == flat["num_envs"]

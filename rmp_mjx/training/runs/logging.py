@@ -165,7 +165,9 @@ class RunLogger:
         """The newest values of what has a headline, after the speed."""
         found = [(m, self._last.get(m.column)) for m in self._headlines]
         shown = [headline(m, float(value)) for m, value in found if value is not None]
-        return " ".join([f"steps/s {self._last['time/steps_per_s']:.0f}", *shown])
+        speed = self._last.get("time/steps_per_s")
+        pace = [] if speed is None else [f"steps/s {speed:.0f}"]
+        return " ".join([*pace, *shown])
 
     def flush(self) -> None:
         """Write all rows to the parquet file, replacing it in one move.
