@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from rmp_mjx.pytree import Pytree
 
@@ -26,13 +27,13 @@ class Vec(Pytree):
     """Third component."""
 
     @classmethod
-    def of(cls, array: Array, axis: int = -1) -> Vec:
+    def of(cls, array: ArrayLike, axis: int = -1) -> Vec:
         """Split an array along an axis of length 3."""
         array = jnp.moveaxis(jnp.asarray(array), axis, 0)
         return cls(array[0], array[1], array[2])
 
     @classmethod
-    def column(cls, array: Array) -> Vec:
+    def column(cls, array: ArrayLike) -> Vec:
         """Split an array (o, 3) into components (o, 1), to broadcast over points."""
         array = jnp.asarray(array)
         return cls(array[:, 0:1], array[:, 1:2], array[:, 2:3])

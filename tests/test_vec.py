@@ -35,4 +35,4 @@ def test_columns_broadcast_over_points():
 
 
 def test_stack_broadcasts_components():
-    assert Vec(jnp.zeros(4), 0.0, jnp.ones((2, 1))).stack().shape == (3, 2, 4)
+    assert Vec(jnp.zeros(4), jnp.zeros(()), jnp.ones((2, 1))).stack().shape == (3, 2, 4)

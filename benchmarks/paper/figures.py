@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import polars as pl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -195,10 +194,10 @@ def montage(images: Sequence[tuple[str, Path]], path: Path, columns: int) -> boo
 
     A packed store has no pictures: then a figure that was drawn before is kept.
     """
-    found = [(title, image) for title, image in images if image.exists()]
+    found = [(title, path) for title, path in images if path.exists()]
     if not found:
         return path.exists()
-    sizes = [mpl.image.imread(image) for _, image in found]
+    sizes = [image.imread(image) for _, image in found]
     height, width = sizes[0].shape[:2]
     cell = (12.0 / columns, 12.0 / columns * height / width + 0.25)
     lines = -(-len(found) // columns)

@@ -257,7 +257,7 @@ def paired(own: Mapping[int, float], other: Mapping[int, float]) -> Paired | Non
     if sd == 0.0:
         p_t, effect, half = float(middle == 0.0), float("nan"), 0.0
     else:
-        p_t = float(scipy_stats.ttest_1samp(gaps, 0.0).pvalue)
+        _, p_t = map(float, scipy_stats.ttest_1samp(gaps, 0.0))
         effect = middle / sd
         half = sd / np.sqrt(len(gaps)) * scipy_stats.t.ppf(0.975, len(gaps) - 1)
     interval = (middle - half, middle + half)

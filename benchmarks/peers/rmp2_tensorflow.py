@@ -19,7 +19,7 @@ import functools
 import sys
 
 import numpy as np
-import tensorflow as tf  # pyright: ignore[reportMissingImports]
+import tensorflow as tf
 
 from benchmarks.peers.worker import Measure, latency, rate, serve
 

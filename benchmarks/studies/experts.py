@@ -22,6 +22,8 @@ from envs import door
 from envs.base import ArmEnv
 from envs.types import State
 from rmp_mjx import runtime
+from rmp_mjx.control.action import ActionRange
+from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.math import orientation_error
 
 EVENTS = ("collision", "self_collision", "joint_limit")
@@ -66,12 +68,18 @@ def start(env: ArmEnv, state: State) -> Memory:
     return Memory(env.site(state.data).R, jnp.zeros((), jnp.int32))
 
 
+def action_range(env: ArmEnv) -> ActionRange:
+    """What -1 and 1 mean to the task's controller."""
+    assert isinstance(env.controller, ImpedanceController), "an expert knows its reach"
+    return env.controller.action_range
+
+
 def command(env: ArmEnv, state: State, R: Array, target: Array) -> Array:
     """Move the grip straight to a target as fast as the action range allows.
 
     The hand keeps the orientation R; all stiffnesses are the greatest.
     """
-    site, span = env.site(state.data), env.controller.action_range
+    site, span = env.site(state.data), action_range(env)
     move = (target - site.p) / span.dpos
     move = move / jnp.maximum(jnp.max(jnp.abs(move)), 1.0)
     turn = jnp.clip(orientation_error(site.R, R) / span.drot, -1.0, 1.0)

@@ -36,7 +36,7 @@ from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 
 Figures = dict[str, np.ndarray]
-Make = Callable[[rmp.Robot], "rmp.RMPVICES | rmp.VICES"]
+Make = Callable[[rmp.Robot], Controller]
 
 REACHING_LIMIT = 300
 """Policy steps after which an episode of four targets ends (15 s)."""
@@ -107,6 +107,7 @@ class _Clipped(rmp.RMPVICES):
 
     def __call__(self, q, qd, setpoint, obstacles):
         out = super().__call__(q, qd, setpoint, obstacles)
+        q, qd = jnp.asarray(q), jnp.asarray(qd)
         Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
         tau, scale = clip_torque(Mq @ out.qdd + bias, self.robot.tau_max)
         return out.replace(

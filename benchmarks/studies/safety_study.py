@@ -17,7 +17,8 @@ from benchmarks.studies.policies import POLICIES, Policies, View, trained
 from envs.base import ArmEnv
 from envs.spheres import AWAY
 from envs.types import State
-from rmp_mjx import RMPVICES, VICES
+from rmp_mjx import RMPVICES
+from rmp_mjx.control.controller import Controller, ImpedanceController
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.learning.networks import Agent
 from rmp_mjx.vec import xyz
@@ -80,7 +81,7 @@ class Study:
 
     def __init__(
         self,
-        controller: RMPVICES | VICES | str,
+        controller: Controller | str,
         groups: Sequence[Group],
         steps: int,
         *,
@@ -109,7 +110,7 @@ class Study:
         self._run = jax.jit(self._simulate)
 
     def run(
-        self, controller: RMPVICES | VICES, seed: int
+        self, controller: Controller, seed: int
     ) -> dict[Group, dict[str, np.ndarray]]:
         """Every step's figures by group, (steps, worlds) each."""
         figures = self._run(parts_of(controller), jax.random.key(seed))
@@ -207,6 +208,7 @@ def parts_of(controller: Any) -> dict[str, Any]:
 def with_parts(env: ArmEnv, parts: dict[str, Any]) -> ArmEnv:
     """The environment with these parts of its controller."""
     env = copy.copy(env)
+    assert isinstance(env.controller, ImpedanceController)
     env.controller = env.controller.replace(**parts)
     return env
 
@@ -242,6 +244,7 @@ def _traced(env: ArmEnv, **values: Array) -> ArmEnv:
 def under(env: ArmEnv, special: dict[str, Array]) -> ArmEnv:
     """The environment with a world's noise, delay and torque limits."""
     env = _traced(env, obstacle_noise=special["noise"], obstacle_delay=special["delay"])
+    assert isinstance(env.controller, ImpedanceController)
     robot = env.controller.robot
     robot = robot.replace(tau_max=special["torque"] * robot.tau_max)
     env.controller = env.controller.replace(robot=robot)

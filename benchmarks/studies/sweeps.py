@@ -157,8 +157,8 @@ class Reaching(NamedTuple):
         return self.reached / max(self.reached + self.missed, 1)
 
 
-Results = Mapping[tuple[str, str, str], Outcome | Reaching]
-"""By cell, controller and policy."""
+Results = Mapping[tuple[str, str, str], Any]
+"""`Outcome` or `Reaching` by cell, controller and policy."""
 
 
 def judge(figures: dict[str, np.ndarray]) -> Outcome:

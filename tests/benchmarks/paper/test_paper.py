@@ -331,6 +331,7 @@ def test_the_page_has_the_papers_numbers_beside_ours(grid, page):
     text = page.read_text()
     paper = published.DEPLOYMENT["vices"]["door"]
     best = targets.best(grid[0], "door", "vices", "close")
+    assert best is not None
     hits = int((best["collision"] > 0).sum())
     low, high = stats.binomtest(hits, 20).proportion_ci(method="exact")
     share = f"{5.0 * hits:.1f} {tables.interval((100 * low, 100 * high))}"

@@ -2,6 +2,7 @@ import pytest
 
 from benchmarks.peers import venv
 from benchmarks.peers.__main__ import COMPARISONS, FLOOR, PEERS, Comparison, compare
+from benchmarks.peers.contestant import Contestant
 from benchmarks.peers.ours import measures
 from benchmarks.peers.worker import latency, rate
 
@@ -17,7 +18,7 @@ def test_keys_of_comparisons_are_unique():
     assert len(set(keys)) == len(keys)
 
 
-class Fake:
+class Fake(Contestant):
     """A contestant that gives one figure after the other, the first for warm-up."""
 
     def __init__(self, *values):

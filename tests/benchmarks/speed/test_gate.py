@@ -155,7 +155,7 @@ def test_the_gate_runs_our_contestant_with_this_interpreter():
     finally:
         contestant.close()
     assert contestant.process.returncode == 0
-    assert sys.executable in contestant.process.args
+    assert sys.executable in str(contestant.process.args)
 
 
 def test_a_failing_contestant_says_why():

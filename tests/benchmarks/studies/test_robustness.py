@@ -13,6 +13,7 @@ from benchmarks.studies import failures, robustness, safety_study, sweeps
 from benchmarks.studies.random_policies import REACHING_LIMIT, poisson
 from benchmarks.studies.safety_study import Group
 from benchmarks.studies.sweeps import AXES, Cell, Outcome, Reaching
+from rmp_mjx.control.controller import ImpedanceController
 
 QUIET = ("collision", "self_collision", "joint_limit")
 
@@ -173,6 +174,7 @@ def test_what_is_special_about_a_group_reaches_its_worlds(env):
     np.testing.assert_allclose(special["torque"], [0.5, 0.5, 1.0])
     np.testing.assert_array_equal(special["spheres"], [2, 2, 0])  # no layout, none
     first = safety_study.under(env, {k: v[0] for k, v in special.items()})
+    assert isinstance(first.controller, ImpedanceController)
     np.testing.assert_allclose(
         first.controller.robot.tau_max, 0.5 * env.robot.tau_max, rtol=1e-6
     )

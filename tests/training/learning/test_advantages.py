@@ -1,5 +1,7 @@
 """Advantages against Brax and against sums written out."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from brax.training.agents.ppo.losses import compute_gae
@@ -10,26 +12,27 @@ from rmp_mjx.training.learning.rollout import Transition
 T, B = 7, 5
 
 
-def transitions(seed, truncated=False):
+def transitions(seed, truncated=False) -> Any:
     rng = np.random.default_rng(seed)
     termination = (rng.random((T, B)) < 0.2).astype(np.float32)
     truncation = (rng.random((T, B)) < 0.2) * (1.0 - termination) * truncated
     zeros = np.zeros((T, B, 1), np.float32)
-    return Transition(
-        obs=zeros,
-        next_obs=zeros,
-        raw_action=zeros,
-        log_prob=zeros[..., 0],
-        reward=rng.normal(size=(T, B)).astype(np.float32),
-        termination=termination,
-        truncation=truncation.astype(np.float32),
-        weight=np.ones((T, B), np.float32),
-    )
+    arrays: dict[str, Any] = {
+        "obs": zeros,
+        "next_obs": zeros,
+        "raw_action": zeros,
+        "log_prob": zeros[..., 0],
+        "reward": rng.normal(size=(T, B)).astype(np.float32),
+        "termination": termination,
+        "truncation": truncation.astype(np.float32),
+        "weight": np.ones((T, B), np.float32),
+    }
+    return Transition(**arrays)
 
 
 def test_without_truncation_the_value_targets_are_those_of_brax():
     data = transitions(0)
-    values = np.random.default_rng(1).normal(size=(T + 1, B)).astype(np.float32)
+    values: Any = np.random.default_rng(1).normal(size=(T + 1, B)).astype(np.float32)
     ours = generalised_advantages(data, values[:-1], values[1:], 0.9, 0.8)
     targets, _ = compute_gae(
         data.truncation,
@@ -67,7 +70,7 @@ def test_with_lambda_one_targets_are_discounted_sums_bootstrapped_at_time_limits
 
 def test_a_masked_step_has_no_advantage_and_passes_none_on():
     data = transitions(4)
-    ones = np.ones((T, B), np.float32)
+    ones: Any = np.ones((T, B), np.float32)
     lost = ones * (np.arange(T) == 3)[:, None]
     masked = data.replace(weight=ones - lost, termination=lost)
     ours = generalised_advantages(masked, ones, ones, 0.9, 0.8)

@@ -123,4 +123,5 @@ def test_training_goes_on_with_some_skipped_updates_and_not_without_any_other(tm
         row(**{"learning/skipped_updates": float(n)}) for n in (updates - 1, updates)
     )
     assert watching.abort_reason([some]) is None
-    assert "non-finite gradients" in watching.abort_reason([some, all_of_them])
+    reason = watching.abort_reason([some, all_of_them])
+    assert reason is not None and "non-finite gradients" in reason

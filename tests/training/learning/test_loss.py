@@ -1,5 +1,7 @@
 """Our loss against Brax's on the same data."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,20 +68,21 @@ def test_loss_and_gradient_are_those_of_brax(problem):
     networks, normalizer, params, data, old = problem
 
     def brax(params):
+        extras: Any = {
+            "state_extras": {"truncation": data.truncation},
+            "policy_extras": {
+                "raw_action": data.raw_action,
+                "log_prob": data.log_prob,
+                "distribution_params": old,
+            },
+        }
         swapped = types.Transition(
             observation=data.obs,
             action=data.raw_action,
             reward=data.reward,
             discount=1.0 - data.termination,
             next_observation=data.next_obs,
-            extras={
-                "state_extras": {"truncation": data.truncation},
-                "policy_extras": {
-                    "raw_action": data.raw_action,
-                    "log_prob": data.log_prob,
-                    "distribution_params": old,
-                },
-            },
+            extras=extras,
         )
         swapped = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), swapped)
         return losses.compute_ppo_loss(

@@ -59,7 +59,7 @@ class Victim:
 
     def wait_for(self, word, at_least=0):
         """Read on to `word N` with N at least this; False if it ends before."""
-        for line in self._process.stdout:
+        for line in self._process.stdout or ():
             self._hear(line)
             if any(w == word and n >= at_least for w, n in self.heard[-1:]):
                 return True

@@ -1,5 +1,6 @@
 """Full disks: what is kept, what is said, and when training stops."""
 
+from typing import Any
 import errno
 import io
 import os
@@ -62,7 +63,7 @@ def test_a_failed_save_leaves_what_was_there_and_nothing_else(tmp_path, full):
 def saver(tmp_path):
     notes = []
     store = Checkpointer(tmp_path / "checkpoints")
-    made = Saver(store, tmp_path, notes.append, 0, Commands("train --resume"))
+    made: Any = Saver(store, tmp_path, notes.append, 0, Commands("train --resume"))
     made.notes = notes
     yield made
     store.close()

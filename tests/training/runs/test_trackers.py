@@ -1,12 +1,13 @@
 """TensorBoard's files, and the trackers that need an extra."""
 
+import importlib
 import io
 import struct
 import sys
 
 import pytest
 from rich.console import Console
-from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto import event_pb2
 
 from rmp_mjx.training.runs import run_folder, trackers
 from rmp_mjx.training.config import ConfigError
@@ -86,7 +87,7 @@ def events(folder):
         data = path.read_bytes()
         while data:
             (size,) = struct.unpack("Q", data[:8])
-            found.append(Event.FromString(data[12 : 12 + size]))
+            found.append(event_pb2.Event.FromString(data[12 : 12 + size]))
             data = data[16 + size :]
     return found
 
@@ -118,7 +119,7 @@ def test_a_resumed_run_keeps_tensorboards_values_up_to_where_it_goes_on(tmp_path
         tensorboard.close(0)
     starts = [e.step for e in events(tmp_path) if e.HasField("session_log")]
     assert starts == [641]
-    assert SessionLog.START == 1
+    assert event_pb2.SessionLog.START == 1
 
 
 @pytest.mark.parametrize("name", trackers.OPTIONAL)
@@ -149,9 +150,7 @@ def test_mlflow_gets_the_rows_and_a_resumed_run_its_old_entry(tmp_path, fake):
     config = small(mlflow="arm")
     log(tmp_path, config)
     log(tmp_path, config, after=10)
-    import mlflow
-
-    said = mlflow.said
+    said = sys.modules["mlflow"].said
     assert [call for call in said if call[0] == "create_run"] == [
         ("create_run", "id of arm", tmp_path.name)
     ]
@@ -164,7 +163,7 @@ def test_weights_and_biases_itself_keeps_the_rows_of_a_run_and_its_continuation(
     tmp_path, monkeypatch
 ):
     pytest.importorskip("wandb", reason="wandb is not installed (extra 'wandb')")
-    from wandb.proto.wandb_internal_pb2 import Record
+    Record = importlib.import_module("wandb.proto.wandb_internal_pb2").Record
 
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")

@@ -4,6 +4,7 @@ It says on standard output what it is doing, line by line.
 """
 
 import sys
+from typing import Any
 from pathlib import Path
 
 from rmp_mjx import runtime
@@ -43,7 +44,8 @@ def speak() -> None:
         say("starting", done)
         return state, done
 
-    Checkpointer.save, RunLogger.add = spoken_save, spoken_add
+    spied: tuple[Any, Any] = (Checkpointer, RunLogger)
+    spied[0].save, spied[1].add = spoken_save, spoken_add
     train_module._start = spoken_start
 
 
