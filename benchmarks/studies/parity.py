@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ from rich.console import Console
 
 import envs
 from benchmarks.common import machine
+from benchmarks.png import save_figure
 from envs.types import State
 from rmp_mjx import runtime
 from rmp_mjx.metric import Metric
@@ -43,9 +44,11 @@ from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.runs import loop, run_folder
 from rmp_mjx.training.stats import bootstrap_curve, bootstrap_mean, interquartile_mean
 
+Which = Literal["ours", "brax"]
+"""One of the loops."""
 TASKS = ("reach", "trajectory")
 """Tasks that the loops can be compared on."""
-LOOPS = {"ours": "#2a6fbb", "brax": "#c0504d"}
+LOOPS: dict[Which, str] = {"ours": "#2a6fbb", "brax": "#c0504d"}
 """The two loops and their colours."""
 TRAIN = {"ours": loop.train, "brax": trainer.train}
 """What trains."""
@@ -141,7 +144,7 @@ def load(name: str) -> tuple[Any, Any]:
 
 
 def train(
-    which: str, task: Any, options: Any, judge: Judge, points: int, **given: Any
+    which: Which, task: Any, options: Any, judge: Judge, points: int, **given: Any
 ) -> Run:
     """Train with one of the loops and judge the policies that it saves on the way."""
     with tempfile.TemporaryDirectory() as folder:
@@ -162,7 +165,7 @@ def train(
     return Run(curve, statistics.median(rows["time/steps_per_s"].to_list()[2:]))
 
 
-def trials(which: str, task: str) -> list[dict[str, float]]:
+def trials(which: Which, task: str) -> list[dict[str, float]]:
     """The settings that a loop is tried with: every rate with every value."""
     name, values = VALUES[which]
     return [
@@ -241,8 +244,7 @@ def plot(results: dict[str, dict[str, Any]], path: Path) -> None:
         axis.set_ylabel("return of an episode", fontsize=9)
         axis.grid(alpha=0.3)
         axis.legend(frameon=False, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
 
 
 def main(args: Sequence[str] | None = None) -> int:

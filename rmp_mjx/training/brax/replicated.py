@@ -15,7 +15,7 @@ BRAX_AXIS = "i"
 lies on an axis of another name."""
 
 
-def put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+def put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Copy a tree to several devices, as `jax.pmap` takes it.
 
     Args:

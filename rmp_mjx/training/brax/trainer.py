@@ -1,6 +1,7 @@
 """Brax's trainer, with the run folder, reports and interruptions of our own loop."""
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ class _Iterations:
         if not steps:
             self._began = time.monotonic()
 
-    def finish(self, steps: int, metrics: dict[str, Any]) -> None:
+    def finish(self, steps: int, metrics: Mapping[str, Any]) -> None:
         """Report an iteration and save it where it is time."""
         jax.effects_barrier()  # the statistics have arrived
         now = time.monotonic()
@@ -181,10 +182,11 @@ def train(
 def _policy_state(params: Any) -> TrainState:
     """The part of a training state that a policy needs (see `loop.load_agent`)."""
     normalizer, policy, _ = params
-    learner = Learner(policy=policy, value=None, policy_opt=None, value_opt=None)
     nothing: Any = None
     return TrainState(
-        learner=learner,
+        learner=Learner(
+            policy=policy, value=nothing, policy_opt=nothing, value_opt=nothing
+        ),
         normalizer=normalizer,
         scale=nothing,
         rollout=nothing,
