@@ -14,9 +14,8 @@ from rmp_mjx import runtime, sim
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.evaluation import evaluate, film, report
 from rmp_mjx.training.learning import networks
-from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs import policies
 from rmp_mjx.training.runs.checkpoint import CheckpointError
-from rmp_mjx.training.runs.loop import load_agent
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -26,7 +25,7 @@ def main(args: Sequence[str] | None = None) -> int:
         options, config = cli.parse_eval(args)
         for task in options.tasks:
             sim.require(task.physics)
-        newer = run_folder.changed_software(Path(options.run)) if options.run else []
+        newer = policies.changed_software(Path(options.run)) if options.run else []
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -37,7 +36,7 @@ def main(args: Sequence[str] | None = None) -> int:
     iterations = 0
     if options.run and config:
         try:
-            iterations, agent = load_agent(
+            iterations, agent = policies.load_agent(
                 env,
                 config,
                 Path(options.run),

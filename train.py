@@ -19,7 +19,7 @@ from rmp_mjx.training.evaluation.learning_curve import (
     plot_learning_curve,
 )
 from rmp_mjx.training.learning import seeds
-from rmp_mjx.training.runs import distributed, metrics, run_folder
+from rmp_mjx.training.runs import distributed, metrics, policies, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
 from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import TrainingFailure, TrainResult, train
@@ -28,13 +28,19 @@ COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.re
 """What messages of a run tell its user to type."""
 
 
-def finish(env, agent, config: TrainConfig, folder, console: Console) -> None:
-    """Evaluate, plot and film the policy of every seed; the primary process writes."""
+def finish(
+    env, result: TrainResult, config: TrainConfig, folder, console: Console
+) -> None:
+    """Plot, evaluate, film and keep every seed's policy; the primary process writes."""
+    agent = result.agent
     primary = distributed.is_primary()
     if primary:
         plot(env, config, folder)
     if config.run.eval_episodes:
         evaluate_seeds(env, agent, config, folder, console, primary)
+    if primary:
+        evaluated = config.run.eval_episodes > 0
+        policies.save(agent, config, folder, result.iterations, evaluated)
     console.print(f"results: {folder}", markup=False, highlight=False)
 
 
@@ -107,9 +113,10 @@ def run(config: TrainConfig, console: Console) -> int:
             print(f"error: {error}", file=sys.stderr)
             return 2 if isinstance(error, ConfigError) else 1
         last = run_folder.EVALUATION if config.run.eval_episodes else run_folder.CURVE
-        reported = result.had_finished and (folder / last).exists()
+        policy = run_folder.seed_folders(config, folder)[-1] / run_folder.POLICY
+        reported = result.had_finished and (folder / last).exists() and policy.exists()
         if not result.exit_code and not reported:
-            finish(env, result.agent, config, folder, console)
+            finish(env, result, config, folder, console)
         return result.exit_code
 
 

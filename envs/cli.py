@@ -22,6 +22,7 @@ from envs.flags import (
 from envs.grid import GRID, Grid, load_grid, open_grid
 from envs.options import Options
 from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.runs import policies
 from rmp_mjx.training.runs.checkpoint import NEWEST
 
 
@@ -82,7 +83,8 @@ class EvalOptions(Generic[Task]):
     task: Task
     """Options of the task; default: the run's."""
     run: str | None = None
-    """Run folder whose newest policy is evaluated."""
+    """Run folder whose newest policy is evaluated, or a policy file; NAME may stand for
+    NAME.safetensors."""
     agent: Literal["policy", "zero", "random"] = "policy"
     """policy (needs run), or zero or random actions."""
     env: EnvName = DEFAULT
@@ -105,7 +107,7 @@ class EvalOptions(Generic[Task]):
     """Draw pictures and a video, where headless rendering is available."""
     out: str | None = None
     """Folder for the results; default: the run's folder, or one under runs/ named
-    after agent, task and controller."""
+    after the policy file, or after agent, task and controller."""
 
     def __post_init__(self):
         """Check the values.
@@ -128,8 +130,11 @@ class EvalOptions(Generic[Task]):
     @property
     def folder(self) -> Path:
         """Folder for the results."""
-        name = f"{self.agent}-{self.task.env}-{self.task.controller}"
-        return Path(self.out or self.run or f"runs/{name}")
+        if self.out:
+            return Path(self.out)
+        if self.run:
+            return policies.results_of(Path(self.run))
+        return Path("runs") / f"{self.agent}-{self.task.env}-{self.task.controller}"
 
 
 def parse_eval(
@@ -145,7 +150,8 @@ def parse_eval(
             is no run folder.
     """
     given = named(args, "env", "run")
-    config = load_config(Path(given["run"])) if given["run"] else None
+    path = policies.find(given["run"]) if given["run"] else None
+    config = load_config(path) if path else None
     env = given["env"] or (config.task.env if config else DEFAULT)
     task = envs.make_options(env)
     if config and config.task.env == env:
@@ -156,9 +162,15 @@ def parse_eval(
     shown = _without_physics(type(task))
     default = EvalOptions(shown(**vars(task)), env=env)
     options = parse(EvalOptions[shown], args, default, env)
-    options = dataclasses.replace(options, task=type(task)(**vars(options.task)))
+    options = dataclasses.replace(
+        options,
+        task=type(task)(**vars(options.task)),
+        run=str(path) if path else options.run,
+    )
     if (options.run is None) == (options.agent == "policy"):
         raise ConfigError("give either --run RUN or --agent zero|random")
+    if path and path.is_file() and options.checkpoint != NEWEST:
+        raise ConfigError(f"{path} is one policy: leave checkpoint out")
     seeds = config.ppo.num_seeds if config else 1
     if not 0 <= options.seed_index < seeds:
         raise ConfigError(

@@ -16,6 +16,7 @@ import tyro
 import envs
 from envs.options import Options
 from rmp_mjx.training.config import ConfigError, TrainConfig, config_of, read_record
+from rmp_mjx.training.policy import load_policy
 from rmp_mjx.training.runs.run_folder import CONFIG
 
 DEFAULT = "trajectory"
@@ -158,14 +159,20 @@ def _flags(record: Mapping[str, Any]) -> list[str]:
     return flags
 
 
-def load_config(folder: Path) -> TrainConfig[Options]:
-    """The configuration that a run was started with.
+def load_config(path: Path) -> TrainConfig[Options]:
+    """The configuration that a run was started with, or a policy trained with.
+
+    Args:
+        path: Run folder or policy file.
 
     Raises:
-        ConfigError: It is no run folder, or its configuration cannot be read.
+        ConfigError: It is neither, or its configuration cannot be read.
     """
-    path = folder / CONFIG
-    record = read_record(path)
+    if path.is_file():
+        record = load_policy(path).about["config"]
+    else:
+        path = path / CONFIG
+        record = read_record(path)
     try:
         return from_record(record)
     except (ValueError, KeyError, TypeError) as error:

@@ -3,11 +3,13 @@
 import dataclasses
 import importlib
 import json
+import shutil
 
 import polars as pl
 import pytest
 
 import envs
+from rmp_mjx.training.runs import policies
 from tests import toy_task
 from tests.training.conftest import run
 
@@ -51,6 +53,47 @@ def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):
     assert len(pl.read_parquet(folder / "episodes.parquet")) == 9
     assert evaluate(options) == 0
     assert json.loads((folder / "eval.json").read_text()) == found
+
+
+def test_a_policy_file_is_evaluated_as_its_run_into_a_folder_of_its_name(
+    evaluate, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "run"
+    result, config = run(folder)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (file,) = policies.save(result.agent, config, folder, result.iterations, False)
+    shutil.copy(file, kept / "toy.safetensors")
+    options = ["--episodes", "9", "--seed", "4", "--no-video", "--run"]
+    assert evaluate([*options, "run"]) == 0
+    wanted = json.loads((folder / "eval.json").read_text())
+    for name in ("kept/toy", "kept/toy.safetensors"):
+        assert evaluate([*options, name]) == 0
+        found = json.loads((tmp_path / "runs" / "toy" / "eval.json").read_text())
+        assert found["run"] == "kept/toy.safetensors"
+        assert {**found, "run": "run"} == wanted
+        shutil.rmtree(tmp_path / "runs")
+    assert [path.name for path in kept.iterdir()] == ["toy.safetensors"]
+    (folder / "eval.json").unlink()
+    assert evaluate([*options, str(file)]) == 0  # a run's own file: into its folder
+    assert (folder / "eval.json").exists()
+    capsys.readouterr()
+    for more in (["--checkpoint", "best"], ["--seed_index", "1"]):
+        assert evaluate([*options, "kept/toy", *more]) == 2
+        assert more[0][2:] in capsys.readouterr().err
+    (kept / "toy.safetensors").write_bytes(b"no policy")
+    assert evaluate([*options, "kept/toy"]) == 2
+    assert "toy.safetensors is damaged" in capsys.readouterr().err
+
+
+def test_a_policy_for_another_task_is_refused(evaluate, tmp_path, capsys):
+    result, config = run(tmp_path / "run")
+    (file,) = policies.save(
+        result.agent, config, tmp_path / "run", result.iterations, False
+    )
+    assert evaluate(["--run", str(file), "--env", "trajectory"]) == 2
+    assert "does not fit the environment" in capsys.readouterr().err
 
 
 def test_options_of_the_task_override_the_runs(evaluate, asked, tmp_path):

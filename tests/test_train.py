@@ -11,6 +11,7 @@ import pytest
 import train
 from envs import grid
 from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.policy import load_policy
 from tests import toy_task
 from tests.training.conftest import SMALL
 
@@ -51,6 +52,11 @@ def test_a_run_trains_evaluates_and_plots(toy, tmp_path):
     assert config["task"]["variant"] == "heavy"
     assert (folder / "learning_curve.png").stat().st_size > 0
     assert not (folder / "video.mp4").exists()
+    about = load_policy(folder / "policy.safetensors").about
+    assert about["config"]["task"] == config["task"]
+    assert (about["iterations"], about["steps"]) == (4, 256)
+    assert about["evaluation"]["success_rate_ci95"] == found["success_rate_ci95"]
+    assert about["evaluation"]["episodes"] == found["episodes"]
 
     assert train.main([*OPTIONS, "--run_dir", str(folder)]) == 2  # not empty
     assert train.main(["--resume", str(folder)]) == 0  # nothing left to do
@@ -97,6 +103,11 @@ def test_several_seeds_leave_a_result_each_and_one_of_all(toy, tmp_path):
     assert curves["steps"].to_list() == [64, 128, 192, 256]
     assert "episode/return_low" in curves.columns
     assert (folder / "learning_curve.png").stat().st_size > 0
+
+    for name, one in zip(("5", "6"), own, strict=True):
+        policy = load_policy(folder / "seeds" / name / "policy.safetensors").about
+        assert policy["config"]["ppo"]["seed"] == int(name)
+        assert policy["evaluation"]["return_mean"] == one["return_mean"]
 
     assert train.main(["--resume", str(folder)]) == 0  # nothing left to do
     (folder / "eval.json").unlink()  # as if it was killed before the evaluation

@@ -8,5 +8,4 @@ then writes the pages. Everything measured lies in parquet files with their prov
 * `training`, `deployment`, `failures`, `pictures`: how the store is filled.
 * `measures`, `targets`, `published`, `tables`: the numbers; `figures`, `page`,
   `report`: the pages.
-* `export`: small copies of policies for `pretrained/`.
 """

@@ -16,11 +16,10 @@ from benchmarks.paper import cells, failures, pictures, store, tasks
 from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.columns import COLUMNS, PICTURED, TABLE, Column
 from benchmarks.paper.store import Store
-from benchmarks.paper.training import run_of
 from rmp_mjx.metric import reductions
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluation import evaluate
-from rmp_mjx.training.runs.loop import load_agent
+from rmp_mjx.training.policy import load_policy
 
 STARTS = 2000
 """Seed of the episodes: the same in every cell, so that all meet the same worlds."""
@@ -69,20 +68,20 @@ def deploy(
     """Run a trained cell's mean policy in a column.
 
     Raises:
-        CheckpointError: The run has no sound checkpoint.
+        PolicyError: The policy's file is missing or damaged.
     """
     column, config = COLUMNS[name], preset.config(cell)
     count = episodes(preset, column)
     filmed = min(RECORDED, count) if name == PICTURED else 0
     env, record = _recorder(deployed(config, column), count, filmed)
-    folder = run_of(place, cell)
-    iterations, agent = load_agent(env, config, folder, True, console.print)
+    policy = load_policy(place.policy(cell))
+    agent = policy.agent(env.observation_size, env.action_size, True)
     began = time.monotonic()
     results, tape = record(agent, jax.random.key(STARTS))
     about = {
         "definition": definition(preset, cell, column),
         "seconds": time.monotonic() - began,
-        "training_iterations": iterations,
+        "training_iterations": policy.about["iterations"],
         "dt": env.dt,
         "reductions": reductions(env.metrics),
         "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from rmp_mjx.training.config import (
     differing_fields,
     read_record,
 )
-from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.policy import PolicyError, load_policy
+from rmp_mjx.training.runs import policies, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
-from rmp_mjx.training.runs.loop import train
+from rmp_mjx.training.runs.loop import TrainResult, train
 
 
 def run_of(place: Store, cell: Cell) -> Path:
@@ -30,33 +32,41 @@ def run_of(place: Store, cell: Cell) -> Path:
 
 
 def is_trained(place: Store, preset: Preset, cell: Cell) -> bool:
-    """Whether a cell's training is in the store, and its run folder still there."""
-    wanted = cells.definition(preset, cell)
-    config = run_of(place, cell) / run_folder.CONFIG
-    return place.holds(wanted, store.TRAINING, cell) and config.exists()
+    """Whether a cell's training is in the store, and its policy with it."""
+    if not place.holds(cells.definition(preset, cell), store.TRAINING, cell):
+        return False
+    try:
+        load_policy(place.policy(cell))
+    except PolicyError:
+        return False
+    return True
 
 
 def check(place: Store, preset: Preset, cell: Cell) -> None:
-    """Refuse a run folder of other settings before anything long starts.
+    """Refuse a store of other settings before anything long starts.
 
     Raises:
-        ConfigError: It holds another run.
+        ConfigError: It holds another run of the cell.
     """
-    folder = run_of(place, cell)
-    saved = _saved(folder)
+    saved = _saved(run_of(place, cell))
     different = differing_fields(saved, preset.config(cell)) if saved else {}
+    if about := place.about(store.TRAINING, cell):
+        old = about["definition"]
+        new = json.loads(json.dumps(cells.definition(preset, cell)))
+        names = [k for k in new if k != "num_timesteps" and new[k] != old.get(k)]
+        different |= {name: (old.get(name), new[name]) for name in names}
     if different:
         changes = ", ".join(f"{k}: {a} -> {b}" for k, (a, b) in different.items())
         raise ConfigError(
-            f"{folder} holds {cell} with other settings ({changes}): delete it, or "
-            "name another folder with --folder"
+            f"{place.folder} holds {cell} with other settings ({changes}): delete it, "
+            "or name another folder with --folder"
         )
 
 
 def train_cell(
     place: Store, preset: Preset, cell: Cell, console: Console, allow_changes: bool
 ) -> int:
-    """Train a cell to its end and put its curves into the store.
+    """Train a cell to its end and put its policy and its curves into the store.
 
     A run that was stopped goes on from its last checkpoint; one without any sound
     checkpoint begins anew.
@@ -72,12 +82,15 @@ def train_cell(
     wanted = preset.config(cell)
     begin = partial(_run, wanted, folder, console, allow_changes)
     try:
-        code = begin(_saved(folder) is not None)
+        result = begin(_saved(folder) is not None)
     except CheckpointError as error:
         console.print(f"{cell} begins anew: {error}", markup=False, highlight=False)
-        code = begin(False)
-    if code:
-        return code
+        result = begin(False)
+    if result.exit_code:
+        return result.exit_code
+    (written,) = policies.save(result.agent, wanted, folder, result.iterations, False)
+    place.policy(cell).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(written, place.policy(cell))
     rows = pl.read_parquet(folder / run_folder.METRICS)
     about = {
         "definition": cells.definition(preset, cell),
@@ -102,8 +115,8 @@ def _run(
     console: Console,
     allow_changes: bool,
     go_on: bool,
-) -> int:
-    """Continue the run in a folder, or begin one there; its exit code."""
+) -> TrainResult:
+    """Continue the run in a folder, or begin one there."""
     config = config.replace(
         allow_changes=allow_changes,
         resume=str(folder) if go_on else None,
@@ -112,4 +125,4 @@ def _run(
     )
     folder, lock = run_folder.open_run(config)
     with lock:
-        return train(tasks.load(config), config, folder, console).exit_code
+        return train(tasks.load(config), config, folder, console)

@@ -34,7 +34,7 @@ from benchmarks.studies.safety_study import Group, Study, parts_of, with_parts
 from envs.flags import load_config
 from rmp_mjx import runtime
 from rmp_mjx.training.learning.networks import Agent
-from rmp_mjx.training.runs.loop import load_agent
+from rmp_mjx.training.runs.policies import load_agent
 
 SEARCH_SEED, REPORT_SEED = 100, 200
 """First seed of the search, and first seed of the report."""

@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from rmp_mjx.files import replacing
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.learning.networks import Agent, make_agent, make_networks
 
 KEY = "rmp_mjx_policy"
@@ -29,7 +30,7 @@ NORMALIZER, NETWORK = "normalizer", "policy"
 """Parts of a policy: the first word of an array's name."""
 
 
-class PolicyError(RuntimeError):
+class PolicyError(ConfigError):
     """A file is no policy that can be used; the message says why."""
 
 

@@ -7,7 +7,8 @@ from envs.cli import make_config
 from rmp_mjx import RMPVICES, Robot
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import run_folder
-from rmp_mjx.training.runs.loop import load_agent, train
+from rmp_mjx.training.runs.loop import train
+from rmp_mjx.training.runs.policies import load_agent
 
 LINK = """
 <body name="b{k}" pos="0 0 {length}">

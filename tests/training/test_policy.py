@@ -122,7 +122,8 @@ def test_a_newer_format_is_refused(agents, tmp_path, monkeypatch):
     ("obs", "act", "message"),
     [
         (
-            (OBS + 1, ACT),
+            OBS + 1,
+            ACT,
             r"0/kernel: float32\[5, 7\] in the file, float32\[6, 7\]",
         ),
         (OBS, ACT + 1, r"Dense_0/bias: float32\[3\] in the file, float32\[4\] for"),

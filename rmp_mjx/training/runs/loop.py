@@ -11,7 +11,7 @@ from rich.console import Console
 
 from rmp_mjx.training.runs import distributed, identity, run_folder
 from rmp_mjx.training.learning import seeds
-from rmp_mjx.training.runs.checkpoint import NEWEST, Checkpointer
+from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.logging import RunLogger
@@ -220,53 +220,12 @@ def _start(
     if checkpoints is None or not config.run.resume or nothing:
         # donation wants distinct buffers
         return programs.place(programs.init(seeds.keys(config.ppo))), 0
-    done, state = checkpoints.restore(seeds.shapes(programs.ppo, config.ppo), console.print)
+    done, state = checkpoints.restore(
+        seeds.shapes(programs.ppo, config.ppo), console.print
+    )
     if done >= config.num_iterations:
         console.print(
             f"{config.run.resume} has finished: {done} iterations; "
             "a larger --num_timesteps continues it"
         )
     return programs.place(state), done
-
-
-def load_agent(
-    env: Env,
-    config: TrainConfig,
-    folder: Path,
-    deterministic: bool,
-    note: Note,
-    seed_index: int = 0,
-    checkpoint: str = NEWEST,
-) -> tuple[int, Agent]:
-    """Read the policy of a run.
-
-    Args:
-        env: The environment it was trained on, or one with the same sizes.
-        config: Configuration of the run.
-        folder: Run folder.
-        deterministic: Act with the mean action.
-        note: Called with one line for each damaged checkpoint.
-        seed_index: Which agent, if the run trained several seeds.
-        checkpoint: `newest`, `best`, or a number.
-
-    Returns:
-        Iterations that trained the policy, and the policy.
-
-    Raises:
-        CheckpointError: There is no usable checkpoint.
-        ConfigError: The run was trained in another environment.
-    """
-    identity.check(identity.saved(folder / run_folder.CONFIG), env, folder)
-    ppo = make_ppo(env, config.ppo)
-    whole = seeds.shapes(ppo, config.ppo)
-    learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)
-    needed = whole.replace(
-        learner=learner, scale=None, rollout=None, key=None, iteration=None
-    )
-    checkpoints = Checkpointer(folder / run_folder.CHECKPOINTS, read_only=True)
-    step, state = checkpoints.restore(needed, note, checkpoint)
-    checkpoints.close()
-    stacked = make_agent(
-        ppo.networks, state.normalizer, state.learner.policy, deterministic
-    )
-    return step, seeds.of_seed(stacked, seed_index, config.ppo)

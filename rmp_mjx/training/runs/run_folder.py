@@ -32,6 +32,7 @@ CONFIG = "config.json"
 VERSIONS = "versions.json"
 METRICS = "metrics.parquet"
 CHECKPOINTS = "checkpoints"
+POLICY = "policy.safetensors"
 TENSORBOARD = "tensorboard"
 NONFINITE = "nonfinite"
 TRACKED = ("wandb_run", "mlflow_run", "wandb")
@@ -63,6 +64,7 @@ RESULTS = (
     VERSIONS,
     METRICS,
     CHECKPOINTS,
+    POLICY,
     TENSORBOARD,
     NONFINITE,
     *TRACKED,
@@ -190,6 +192,13 @@ def _history(folder: Path) -> list[dict[str, str]]:
 def changed_software(folder: Path) -> list[str]:
     """What is not as it was when a run was last continued; starts no JAX backend."""
     return changes_since(_history(folder), software())
+
+
+def trained_with(folder: Path) -> dict[str, str]:
+    """Packages, code and device that a run was last continued with."""
+    last = _history(folder)[-1:] or [{}]
+    kept = (*PACKAGES, "python", "git", "device")
+    return {name: last[0][name] for name in kept if name in last[0]}
 
 
 def changes_since(history: list[dict[str, str]], now: dict[str, str]) -> list[str]:

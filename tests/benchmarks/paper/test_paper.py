@@ -11,7 +11,6 @@ import threading
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import polars as pl
 import pytest
 from flax import struct
@@ -22,7 +21,6 @@ from benchmarks.paper import (
     __main__,
     cells,
     deployment,
-    export,
     failures,
     measures,
     pictures,
@@ -32,6 +30,7 @@ from benchmarks.paper import (
     tables,
     targets,
     tasks,
+    training,
     work,
 )
 from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
@@ -42,7 +41,6 @@ from envs.measures import METRICS
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import run_folder, saving
-from rmp_mjx.training.runs.loop import load_agent
 from tests.training.toys import ToyState
 
 
@@ -241,10 +239,30 @@ def test_a_damaged_part_is_made_anew_and_a_changed_one_too(grid):
     assert deployment.is_deployed(place, longer, cell, "close")
 
 
+def test_a_cell_whose_policy_is_damaged_is_not_trained(grid):
+    place, cell = grid[0], Cell("door", "vices", 0)
+    path = place.policy(cell)
+    whole = path.read_bytes()
+    assert training.is_trained(place, TINY, cell)
+    assert len(whole) < 200_000
+    try:
+        path.write_bytes(whole[:-1])
+        assert not training.is_trained(place, TINY, cell)
+    finally:
+        path.write_bytes(whole)
+
+
+def test_a_packed_store_of_other_settings_is_refused(grid, tmp_path):
+    grid[0].pack(tmp_path)
+    other = dataclasses.replace(TINY, training=TINY.training.replace(gae_lambda=0.5))
+    with pytest.raises(ConfigError, match=r"gae_lambda: 0\.97 -> 0\.5"):
+        work.run(Store(tmp_path), other, other.cells(), QUIET)
+
+
 def test_a_run_of_other_settings_is_refused_before_anything_starts(grid, monkeypatch):
     monkeypatch.setattr(work, "_do", lambda *args: pytest.fail("started"))
-    training = dataclasses.replace(TINY.training, learning_rate=1e-3)
-    other = dataclasses.replace(TINY, training=training)
+    other = TINY.training.replace(learning_rate=1e-3)
+    other = dataclasses.replace(TINY, training=other)
     with pytest.raises(ConfigError, match=r"learning_rate: 0\.0003 -> 0\.001"):
         work.run(Store(grid[0].folder), other, other.cells(), QUIET)
 
@@ -357,11 +375,14 @@ def test_the_page_and_its_figures_are_the_same_from_a_packed_store(
         assert same.read_bytes() == path.read_bytes(), path.name
 
 
-def test_a_new_part_comes_before_what_is_packed(grid, tmp_path):
+def test_what_is_packed_is_done_and_a_new_part_comes_before_it(
+    grid, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(work, "_do", lambda *args: pytest.fail("done again"))
     grid[0].pack(tmp_path)
     place, cell = Store(tmp_path), Cell("door", "vices", 0)
     assert place.provenance == grid[0].provenance
-    assert deployment.is_deployed(place, TINY, cell, "free")
+    assert work.run(place, TINY, TINY.cells(), QUIET) == 0
     rows = measures.of(grid[0].episodes, task="door", variant="vices", seed=0)
     rows = rows.filter(column="free").with_columns(pl.lit(7.0).alias("return"))
     place.write(rows, {"definition": {"episodes": 5}}, store.EPISODES, cell, "free")
@@ -390,24 +411,6 @@ def test_targets_without_measurements_are_said_to_be_unmeasured(grid):
     empty = targets.targets(Store(grid[0].folder / "nothing"))
     assert len(empty) == 33
     assert {t.verdict for t in empty} == {"undecided"}
-
-
-def test_an_exported_policy_is_small_and_acts_the_same(grid, toy, tmp_path):
-    run = grid[0].folder / "runs" / Cell("door", "rmp_vices", 0).file
-    out = tmp_path / "pretrained" / "door-rmp_vices"
-    assert export.main([str(run), str(out)]) == 0
-    size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
-    assert size < 200_000
-    config = TINY.config(Cell("door", "rmp_vices", 0))
-    obs = jnp.ones((3, 2))
-    actions = [
-        load_agent(tasks.load(config), config, folder, True, pytest.fail)
-        for folder in (run, out)
-    ]
-    assert actions[0][0] == actions[1][0] == 4
-    key = jax.random.key(0)
-    np.testing.assert_array_equal(actions[0][1](obs, key), actions[1][1](obs, key))
-    assert export.main([str(run), str(out)]) == 2  # exists
 
 
 @pytest.mark.slow

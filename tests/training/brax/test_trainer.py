@@ -18,7 +18,7 @@ from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.learning import rollout
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.logging import RunLogger
-from rmp_mjx.training.runs.loop import load_agent
+from rmp_mjx.training.runs.policies import load_agent
 from rmp_mjx.training.runs.stopping import TrainingFailure
 from tests.training import toys
 from tests.training.conftest import ITERATIONS, SMALL, small

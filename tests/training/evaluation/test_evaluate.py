@@ -6,7 +6,7 @@ import pytest
 
 from rmp_mjx.training.evaluation import evaluate, recording
 from rmp_mjx.training.learning.networks import random_agent, zero_agent
-from rmp_mjx.training.runs.loop import load_agent
+from rmp_mjx.training.runs.policies import load_agent
 from tests.training import toys
 
 EPISODES = 12

@@ -12,7 +12,7 @@ from rmp_mjx.training.evaluation.evaluate import over_seeds
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import metrics, run_folder
-from rmp_mjx.training.runs.loop import load_agent
+from rmp_mjx.training.runs.policies import load_agent
 from tests.training import toys
 from tests.training.conftest import ITERATIONS, bits, run, small
 

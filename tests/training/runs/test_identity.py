@@ -7,7 +7,8 @@ import pytest
 
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import identity, run_folder
-from rmp_mjx.training.runs.loop import load_agent, train
+from rmp_mjx.training.runs.loop import train
+from rmp_mjx.training.runs.policies import load_agent
 from tests.training import toys
 from tests.training.conftest import small
 

@@ -15,6 +15,7 @@ from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.config import ConfigError, config_of, read_record
 from rmp_mjx.training.runs.logging import RunLogger
+from rmp_mjx.training.runs.policies import load_agent
 from rmp_mjx.training.runs.stopping import StopRequest
 from tests.training import toys
 from tests.training.conftest import ITERATIONS, bits, newest_state, run, small
@@ -158,7 +159,7 @@ def test_the_policy_of_any_kept_checkpoint_can_be_read(finished):
     obs = jax.numpy.ones((1, 3))
     actions = {}
     for which in ("newest", "best", "2", "4"):
-        iteration, agent = train_module.load_agent(
+        iteration, agent = load_agent(
             toys.Counter(), config, folder, True, pytest.fail, checkpoint=which
         )
         actions[which] = iteration, float(agent(obs, jax.random.key(0))[0, 0])
