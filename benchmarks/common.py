@@ -228,10 +228,16 @@ def write_json(path: Path, rows: Iterable[Row], **settings: Any) -> None:
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(),
         "settings": settings,
-        "rows": [asdict(row) for row in rows],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, indent=2) + "\n")
+    path.write_text(as_json(document, [asdict(row) for row in rows]))
+
+
+def as_json(document: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> str:
+    """A document and its rows as JSON, with one line for each row."""
+    text = json.dumps({**document, "rows": []}, indent=2)
+    lines = ",\n".join(f"    {json.dumps(row)}" for row in rows)
+    return text.replace('"rows": []', f'"rows": [\n{lines}\n  ]') + "\n"
 
 
 def show(rows: Iterable[Row], title: str) -> None:
