@@ -11,14 +11,17 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import polars as pl
+import polars.selectors as cs
 
 from benchmarks.paper.cells import Cell
+from benchmarks.paper.columns import PICTURED
 from rmp_mjx.files import replacing
 
 KEY = "rmp_mjx"
@@ -29,6 +32,19 @@ PLACE = ("task", "variant", "seed", "column")
 """Columns that say which part a row belongs to; training has no `column`."""
 PARTS, POLICIES = "parts.parquet", "policies"
 """The provenance of packed parts, and the folder of the policies."""
+FURTHER = (
+    "length",
+    "arm_collision",
+    "obstacle_collision",
+    "contact_force_peak",
+    "contact_impulse",
+    "clearance",
+    "joint_jerk",
+    "torque_saturation",
+    "unplaced_obstacles",
+    "lost",
+)
+"""Columns of episodes that are packed for the deployment `PICTURED` alone."""
 PACKED = {
     TRAINING: (
         *PLACE[:3],
@@ -52,24 +68,15 @@ PACKED = {
     EPISODES: (
         *PLACE,
         "return",
-        "length",
         "success",
         "collision",
-        "arm_collision",
-        "obstacle_collision",
         "self_collision",
         "joint_limit",
-        "contact_force_peak",
-        "contact_impulse",
-        "clearance",
-        "joint_jerk",
-        "torque_saturation",
-        "unplaced_obstacles",
-        "lost",
+        *FURTHER,
     ),
     EVENTS: None,
 }
-"""Columns that are packed, where a kind has them; None: all."""
+"""Columns that are packed, if a kind has them; None: all."""
 LEVEL = 22
 """Compression of packed files: zstd's strongest."""
 
@@ -174,9 +181,7 @@ class Store:
         abouts = self.provenance
         files = {PARTS: pl.DataFrame({"about": [json.dumps(each) for each in abouts]})}
         for kind, columns in PACKED.items():
-            rows = self._all(kind)
-            kept = [name for name in columns or rows.columns if name in rows.columns]
-            files[f"{kind}.parquet"] = rows.select(kept)
+            files[f"{kind}.parquet"] = _packed(self._all(kind), columns)
         for name, rows in files.items():
             with replacing(folder / name) as temporary:
                 rows.write_parquet(
@@ -222,6 +227,17 @@ class Store:
         keys = [name for name in PLACE if name in rows.columns]
         parts = rows.partition_by(keys, maintain_order=True)
         return {_name_of(part.row(0, named=True)): part for part in parts}
+
+
+def _packed(rows: pl.DataFrame, columns: Sequence[str] | None) -> pl.DataFrame:
+    """The columns that are packed, and numbers with 32 bits."""
+    kept = [name for name in columns or rows.columns if name in rows.columns]
+    rows = rows.select(kept).with_columns(cs.float().cast(pl.Float32))
+    if "column" not in kept:
+        return rows
+    pictured = pl.when(pl.col("column") == PICTURED)
+    further = [name for name in FURTHER if name in kept]
+    return rows.with_columns(pictured.then(name).alias(name) for name in further)
 
 
 def _name(cell: Cell, column: str | None) -> str:
