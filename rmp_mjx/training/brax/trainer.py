@@ -180,7 +180,7 @@ def train(
 
 
 def _policy_state(params: Any) -> TrainState:
-    """The part of a training state that a policy needs (see `loop.load_agent`)."""
+    """The part of a training state that a policy needs (see `policies.load_agent`)."""
     normalizer, policy, _ = params
     nothing: Any = None
     return TrainState(
