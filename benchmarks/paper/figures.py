@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 from benchmarks.paper import measures, pictures, targets
 from benchmarks.paper.cells import PAPER, TASKS, VARIANTS, Cell
@@ -197,7 +198,7 @@ def montage(images: Sequence[tuple[str, Path]], path: Path, columns: int) -> boo
     found = [(title, path) for title, path in images if path.exists()]
     if not found:
         return path.exists()
-    sizes = [image.imread(image) for _, image in found]
+    sizes = [imread(image) for _, image in found]
     height, width = sizes[0].shape[:2]
     cell = (12.0 / columns, 12.0 / columns * height / width + 0.25)
     lines = -(-len(found) // columns)

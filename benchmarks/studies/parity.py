@@ -41,7 +41,7 @@ from rmp_mjx.metric import Metric
 from rmp_mjx.training.brax import trainer
 from rmp_mjx.training.config import PPOConfig, RunConfig, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
-from rmp_mjx.training.runs import loop, run_folder
+from rmp_mjx.training.runs import loop, policies, run_folder
 from rmp_mjx.training.stats import bootstrap_curve, bootstrap_mean, interquartile_mean
 
 Which = Literal["ours", "brax"]
@@ -157,7 +157,7 @@ def train(
             TRAIN[which](task, config, Path(folder), Console(quiet=True))
         curve = []
         for done in range(each, config.num_iterations + 1, each):
-            _, agent = loop.load_agent(
+            _, agent = policies.load_agent(
                 task, config, Path(folder), True, print, checkpoint=str(done)
             )
             curve.append((done * config.ppo.steps_per_iteration, judge(agent)))

@@ -39,6 +39,7 @@ from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
 from benchmarks.paper.columns import COLUMNS
 from benchmarks.paper.store import Store
 from envs.cli import make_config
+from envs.flags import load_config
 from envs.measures import METRICS
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import ConfigError
@@ -175,6 +176,12 @@ def test_the_results_of_the_repository_are_those_of_the_preset(root):
         cell = Cell(about["task"], about["variant"], about["seed"])
         if about["kind"] == store.TRAINING:
             wanted = cells.definition(preset, cell)
+            assert training.is_trained(place, preset, cell)
+            config = load_config(place.policy(cell))
+            assert (config.task, config.ppo) == (
+                preset.config(cell).task,
+                preset.config(cell).ppo,
+            )
         else:
             column = COLUMNS[about["column"]]
             wanted = deployment.definition(preset, cell, column)
