@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 
 def psd_solve(
@@ -120,7 +120,7 @@ def safe_norm(x: Float[Array, "*b n"], eps: float = 1e-12) -> Float[Array, "*b"]
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
 
 
-def critical_damping(kp: Float[Array, "*s"] | float) -> Float[Array, "*s"]:
+def critical_damping(kp: Float[ArrayLike, "*s"]) -> Float[Array, "*s"]:
     """Damping gain ``2 sqrt(kp)`` [1/s] for a stiffness ``kp`` [1/s^2].
 
     The gradient at ``kp = 0`` is zero rather than infinite.
@@ -247,7 +247,7 @@ def ramp(
 
 
 def orientation_error(
-    R: Float[Array, "3 3"], R_des: Float[Array, "3 3"]
+    R: Float[Array, "3 3"], R_des: Float[ArrayLike, "3 3"]
 ) -> Float[Array, " 3"]:
     r"""Orientation error $e_r = \tfrac12 \sum_i r_i \times r_{g,i}$.
 

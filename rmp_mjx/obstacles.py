@@ -95,7 +95,9 @@ class Obstacles(Pytree):
             rho: Radii, (p,) [m].
             hand: Which of them are the hand's, (p,) bool.
         """
-        return {KINDS[type(kind)]: kind.gap(x, v, rho, hand) for kind in self.kinds}
+        x, v = (vector.map(lambda c: c[None]) for vector in (x, v))
+        found = (kind.gap(x, v, rho[None], hand) for kind in self.kinds)
+        return {KINDS[type(k)]: gap for k, gap in zip(self.kinds, found, strict=True)}
 
     def with_spheres(
         self,

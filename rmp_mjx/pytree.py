@@ -14,12 +14,12 @@ from flax import struct
 from jax import Array
 from jax.core import Tracer
 
-# A JAX array, a tracer or a NumPy array. Constants stay float64 NumPy arrays until they
-# are traced, so that they serve any precision.
+# A JAX array, a tracer, a NumPy array or a NumPy number. Constants stay float64 NumPy
+# arrays until they are traced, so that they serve any precision.
 if TYPE_CHECKING:
     from typing import Any as Constant
 else:
-    Constant = Array | np.ndarray
+    Constant = Array | np.ndarray | np.generic
 
 _WIDTH = 88
 

@@ -56,12 +56,17 @@ class Shape(Pytree, abc.ABC):
     """Whether the slot is in use."""
 
     @abc.abstractmethod
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
-        """Distance of every control point to every obstacle; see `Obstacles.gaps`."""
+    def gap(
+        self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
+    ) -> Gap:
+        """Distance of every control point to every obstacle; see `Obstacles.gaps`.
+
+        Positions x and velocities v are (1, p) each.
+        """
 
     def _avoided(self, hand: Bool[np.ndarray, " p"]) -> Bool[Array, "o p"]:
         """Which control points avoid which obstacles."""
-        exempt = self.hand_may_touch[:, None] & hand
+        exempt = self.hand_may_touch[:, None] & hand[None]
         return jnp.asarray(self.active)[:, None] & ~exempt
 
 
@@ -93,7 +98,9 @@ class Spheres(Shape):
     radius: Float[Constant, " o"]
     """Radius [m]."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+    def gap(
+        self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
+    ) -> Gap:
         """Distances, rates, normals and curvatures, (o, p) each."""
         g = x - Vec.column(self.center)
         gdot = v - Vec.column(self.velocity)
@@ -108,7 +115,9 @@ class Planes(Shape):
     normal: Float[Constant, "o 3"]
     """Unit normal that points out of the obstacle."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+    def gap(
+        self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
+    ) -> Gap:
         """Distances, rates, normals and curvatures, (o, p) each."""
         n = Vec.column(self.normal)
         distance = n @ (x - Vec.column(self.point)) - rho
@@ -124,7 +133,9 @@ class Capsules(Turning):
     half_length: Float[Constant, " o"]
     """Half the segment's length [m]."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+    def gap(
+        self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
+    ) -> Gap:
         """Distances, rates, normals and curvatures, (o, p) each."""
         axis, half = Vec.column(self.axis), self.half_length[:, None]
         r, rel, coriolis = self._ride_along(x, v)
@@ -144,7 +155,9 @@ class Boxes(Turning):
     half_size: Float[Constant, "o 3"]
     """Half sizes of the core [m]."""
 
-    def gap(self, x: Vec, v: Vec, rho: Array, hand: Bool[np.ndarray, " p"]) -> Gap:
+    def gap(
+        self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
+    ) -> Gap:
         """Distances, rates, normals and curvatures, (o, p) each.
 
         Inside the core the distance is minus the depth below the nearest face.

@@ -13,17 +13,17 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from rmp_mjx.pytree import Pytree
+from rmp_mjx.pytree import Constant, Pytree
 
 
 class Vec(Pytree):
     """A 3-vector field; the components have one shape, or broadcast."""
 
-    x: Array
+    x: Constant | float
     """First component."""
-    y: Array
+    y: Constant | float
     """Second component."""
-    z: Array
+    z: Constant | float
     """Third component."""
 
     @classmethod

@@ -155,7 +155,9 @@ def _moved(args, kind, t):
         return getattr(slots, f"with_{kind}")(*args)
     velocity, spin = args[-2:]
     K = np.cross(spin[:, None], -np.eye(3))
-    turn = np.eye(3) + t * K + 0.5 * t**2 * (K @ K)  # exact in two derivatives at t = 0
+    turn = (
+        np.eye(3)[None] + t * K + 0.5 * t**2 * (K @ K)
+    )  # exact in two derivatives at t = 0
     if kind == "capsules":
         middle, arm = 0.5 * (args[0] + args[1]), 0.5 * (args[1] - args[0])
         middle = middle + t * velocity

@@ -30,7 +30,7 @@ def test_split_and_stack_are_inverse_along_any_axis():
 
 
 def test_columns_broadcast_over_points():
-    difference = Vec.of(A) - Vec.column(B[:2])
+    difference = Vec.of(A[None]) - Vec.column(B[:2])
     np.testing.assert_allclose(difference.stack(-1), A[None] - B[:2, None], rtol=1e-6)
 
 

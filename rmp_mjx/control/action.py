@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from rmp_mjx.control.arguments import check
 from rmp_mjx.math import exp_so3
@@ -51,7 +51,7 @@ def compose_setpoint(
     p: Float[Array, " 3"],
     R: Float[Array, "3 3"],
     action: Action,
-    time: Float[ArrayLike, ""] | float,
+    time: Real[ArrayLike, ""],
 ) -> Setpoint:
     """Displace the current site pose by the action (paper, section II-B).
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rmp_mjx.control.leaves import CollisionLeaf, leaf_of
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.rmp import RMP, ScalarLeaf
+from rmp_mjx.rmp.leaf import Param
 from rmp_mjx.robot.kinematics import (
     ArmState,
     Motion,
@@ -53,11 +54,16 @@ def obstacle_branch(
         )
         own = leaf_of(leaf, kind)
         if own is not None:
-            rmp = _sum_obstacles(gap, own)
+            rmp = _sum_obstacles(gap, jax.tree.map(_for_all_obstacles, own))
             total = rmp if total is None else jax.tree.map(jnp.add, total, rmp)
     if total is None or not robot.points.segment:
         return RMP.zero(robot.n, arm.p.dtype), clearance
     return pull_to_joints(robot, arm, points, total), clearance
+
+
+def _for_all_obstacles(parameter: Param) -> Param:
+    """A parameter that is one for each point, with an axis for the obstacles."""
+    return jnp.asarray(parameter)[None] if jnp.ndim(parameter) == 1 else parameter
 
 
 def _sum_obstacles(gap: Gap, leaf: ScalarLeaf) -> PointRMP:

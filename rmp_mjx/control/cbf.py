@@ -150,7 +150,7 @@ class FilteredVICES(VICES):
         length = jnp.sqrt(jnp.sum(G * G, axis=0))
         active = jnp.concatenate([barriers.active, limits]) & (length > FREE)
         scale = jnp.where(active, 1.0 / jnp.where(active, length, 1.0), 0.0)
-        G = G * scale
+        G = G * scale[None]
         h = jnp.where(active, jnp.clip(h * scale, -LARGEST, LARGEST), LARGEST)
         _, kept = jax.lax.top_k(-h, min(KEPT, len(h)))
         change, solved = project(G[:, kept], h[kept], self.penalty)
@@ -173,7 +173,8 @@ def _points(robot: Robot, arm: ArmState, obstacles: Obstacles) -> Barriers | Non
     segment = np.array(robot.points.segment, int)
     moves = np.arange(robot.n)[:, None] <= segment
     spin, shift = (v.map(lambda c: c[:, None]) for v in (arm.S.ang, arm.S.lin))
-    J = (shift + spin.cross(points.x)).map(lambda c: jnp.where(moves, c, 0.0))
+    x, a = (v.map(lambda c: c[None]) for v in (points.x, points.a))
+    J = (shift + spin.cross(x)).map(lambda c: jnp.where(moves, c, 0.0)[None])
     found = []
     gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
     for gap in gaps.values():
@@ -183,7 +184,7 @@ def _points(robot: Robot, arm: ArmState, obstacles: Obstacles) -> Barriers | Non
             Barriers(
                 gap.distance.ravel(),
                 gap.rate.ravel(),
-                (gap.curvature + normal @ points.a).ravel(),
+                (gap.curvature + normal @ a).ravel(),
                 rows.swapaxes(1, 2).reshape(-1, robot.n),
                 gap.active.ravel(),
             )

@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.arguments import check, check_action
@@ -66,7 +66,7 @@ class ImpedanceController(Pytree):
         self,
         q: Float[ArrayLike, " n"],
         action: Action,
-        time: Float[ArrayLike, ""] | float,
+        time: Real[ArrayLike, ""],
     ) -> Setpoint:
         """Impedance target: the current site pose displaced by the action.
 

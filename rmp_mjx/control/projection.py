@@ -46,7 +46,7 @@ def project(
     def newton(state):
         x, _, count = state
         over = x @ G - h
-        violated = jnp.where(over > 0.0, G, 0.0)
+        violated = jnp.where(over[None] > 0.0, G, 0.0)
         gradient = x + penalty * (G @ jnp.maximum(over, 0.0))
         step = -psd_solve(eye + penalty * violated @ G.T, gradient)
         rise = step @ G

@@ -5,9 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rmp_mjx.pytree import Constant
+
 
 def scale_torque(
-    dynamic: Float[Array, " n"], bias: Float[Array, " n"], tau_max: Float[Array, " n"]
+    dynamic: Float[Array, " n"],
+    bias: Float[Array, " n"],
+    tau_max: Float[Constant, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     r"""Torque within the limits that keeps the direction of the acceleration.
 
@@ -35,7 +39,7 @@ def scale_torque(
 
 
 def clip_torque(
-    tau: Float[Array, " n"], tau_max: Float[Array, " n"]
+    tau: Float[Array, " n"], tau_max: Float[Constant, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Clip each joint separately, as VICES and robosuite do.
 

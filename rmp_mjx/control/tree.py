@@ -82,13 +82,13 @@ class Masked(Leaf):
 
     leaf: ScalarLeaf
     """The leaf."""
-    active: Bool[Array, " 1"]
-    """Whether the slot is in use."""
+    active: Bool[Array, "*o 1"]
+    """Whether the slot is in use; o slots for o stacked siblings."""
 
     def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
         """RMP at a distance and its rate."""
         rmp = self.leaf(x, xd)
-        return RMP(f=rmp.f * self.active, M=rmp.M * self.active)
+        return RMP(f=rmp.f * self.active, M=rmp.M * self.active[:, None])
 
 
 def _point_nodes(robot: Robot, obstacles: Obstacles, leaf: CollisionLeaf) -> Siblings:

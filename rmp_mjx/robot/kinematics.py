@@ -248,7 +248,7 @@ def _carry(
     frames = jnp.concatenate([R, p[:, None]], axis=1)
     x = _dot(frames.reshape(3, -1), axes.reshape(-1, len(segment)))
     if (segment < 0).any():
-        fixed = (offset - base_point(robot)) * (segment < 0)[:, None]
+        fixed = (offset - base_point(robot)[None]) * (segment < 0)[:, None]
         x = x + fixed.T
     return Vec.of(x, 0), carrier
 

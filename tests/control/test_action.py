@@ -61,26 +61,14 @@ def test_a_non_finite_entry_counts_as_zero(bad):
     np.testing.assert_array_equal(action.dpos[0], _decode(0.5).dpos[0])
 
 
-def test_a_wrong_size_is_refused():
-    message = r"action must be a float array of shape \(12,\), got float32 \(6,\)"
-    with pytest.raises(ValueError, match=message):
-        RANGE.decode(jnp.zeros(6))
-
-
 def test_ranges_are_parameters():
     wide = ActionRange(dpos=0.1, drot=0.5, kp_min=1.0, kp_max=100.0)
     action = wide.decode(jnp.ones(12))
     np.testing.assert_allclose(action.dpos, 0.1, rtol=1e-6)
     np.testing.assert_allclose(action.kp_ori, 100.0, rtol=1e-6)
-    kp = jax.vmap(lambda r: r.decode(jnp.ones(12)).kp_pos[0])(
-        wide.replace(
-            kp_max=jnp.array([50.0, 200.0]),
-            **{
-                name: jnp.full(2, getattr(wide, name))
-                for name in ("dpos", "drot", "kp_min")
-            },
-        )
-    )
+    kp = jax.vmap(
+        lambda most: wide.replace(kp_max=most).decode(jnp.ones(12)).kp_pos[0]
+    )(jnp.array([50.0, 200.0]))
     np.testing.assert_allclose(kp, [50.0, 200.0], rtol=1e-6)
 
 

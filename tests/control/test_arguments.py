@@ -1,5 +1,7 @@
 """Arguments of a wrong shape or dtype: the message names them."""
 
+import copy
+import inspect
 import re
 
 import jax
@@ -7,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx import RMPVICES, VICES, Action, Obstacles, Robot
+from rmp_mjx import RMPVICES, VICES, Action, ActionRange, Obstacles, Robot
 from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx.control.controller import ImpedanceController
 from tests.robot.test_model import GRIPPER
 
 Q = np.zeros(3, np.float32)
@@ -21,14 +24,29 @@ def robot():
     return Robot.from_mjcf(GRIPPER, site="tip", spacing=0.1)
 
 
+@pytest.fixture(autouse=True)
+def own_checks_only(monkeypatch):
+    """Without jaxtyping's checks, which a run of the tests may add."""
+    for cls in (ActionRange, ImpedanceController, RMPVICES, VICES, FilteredVICES):
+        for name in {"decode", "setpoint", "__call__"} & vars(cls).keys():
+            monkeypatch.setattr(cls, name, inspect.unwrap(vars(cls)[name]))
+
+
+def changed(tree, **fields):
+    """The tree with other fields, whatever their types."""
+    tree = copy.copy(tree)
+    vars(tree).update(fields)
+    return tree
+
+
 def call(ctrl, q=Q, qd=Q, obstacles=SLOTS, **fields):
     """Trace the controller with these arguments and fields of the set-point."""
-    setpoint = ctrl.setpoint(Q, ACTION, 0.0).replace(**fields)
+    setpoint = changed(ctrl.setpoint(Q, ACTION, 0.0), **fields)
     return jax.eval_shape(lambda: ctrl(q, qd, setpoint, obstacles))
 
 
 def spheres(**fields):
-    return {"obstacles": SLOTS.replace(spheres=SLOTS.spheres.replace(**fields))}
+    return {"obstacles": SLOTS.replace(spheres=changed(SLOTS.spheres, **fields))}
 
 
 WRONG = {
@@ -110,8 +128,17 @@ def test_an_action_and_a_set_point_are_not_confused(robot):
     with pytest.raises(ValueError, match=r"action must be an Action, got ndarray"):
         ctrl.setpoint(Q, np.zeros(12), 0.0)
     with pytest.raises(ValueError, match=r"action\.drot must be .* got float64 \(4,\)"):
-        ctrl.setpoint(Q, ACTION.replace(drot=np.zeros(4)), 0.0)
+        ctrl.setpoint(Q, changed(ACTION, drot=np.zeros(4)), 0.0)
     with pytest.raises(ValueError, match="setpoint must be a Setpoint, got Action"):
         ctrl(Q, Q, ACTION, SLOTS)
-    with pytest.raises(ValueError, match=r"action must be .* got int64 \(12,\)"):
-        ctrl.decode(np.zeros(12, int))
+
+
+def test_a_policys_numbers_must_be_twelve_floats(robot):
+    message = r"action must be a float array of shape \(12,\), got "
+    for wrong, given in (
+        (np.zeros(12, int), r"int64 \(12,\)$"),
+        (np.zeros(6), r"float64 \(6,\)$"),
+        (np.zeros((4, 12)), r"float64 \(4, 12\); batches go through"),
+    ):
+        with pytest.raises(ValueError, match=message + given):
+            VICES(robot).decode(wrong)

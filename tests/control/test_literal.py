@@ -26,18 +26,18 @@ def act(literal):
     """Output, site, inertia and limiter's metric; float64."""
 
     @jax.jit(compiler_options=QUICK)
-    def run(qd, center):
+    def run(q, qd, center):
         slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
-        setpoint = literal.setpoint(Q, literal.decode(ACTION), 0.0)
-        arm = arm_state(literal.robot, Q, qd)
-        out = literal(Q, qd, setpoint, slots)
+        setpoint = literal.setpoint(q, literal.decode(ACTION), 0.0)
+        arm = arm_state(literal.robot, q, qd)
+        out = literal(q, qd, setpoint, slots)
         Mq, _ = dynamics(literal.robot, arm)
-        limiter = literal.leaves.joint_limit.scalar(Q, qd)[1]
+        limiter = literal.leaves.joint_limit.scalar(q, qd)[1]
         return out, site_state(literal.robot, arm), Mq, limiter
 
     def call(qd, center):
         with jax.enable_x64(True):
-            return jax.device_get(run(np.asarray(qd), np.asarray(center)))
+            return jax.device_get(run(Q, np.asarray(qd), np.asarray(center)))
 
     return call
 

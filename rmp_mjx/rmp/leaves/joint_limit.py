@@ -40,7 +40,9 @@ class JointLimitBarrier(ScalarLeaf):
         return f_lower - f_upper, m_lower + m_upper
 
 
-def _span(lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+def _span(
+    lower: Float[Constant, "*s"], upper: Float[Constant, "*s"]
+) -> tuple[Array, Array, Array]:
     """Finite lower end and width, and the mask of joints limited on both sides."""
     limited = jnp.isfinite(lower) & jnp.isfinite(upper)
     low = jnp.where(limited, lower, 0.0)
