@@ -53,6 +53,7 @@ class _Iterations:
         watch: Watch,
         stop: StopRequest,
     ):
+        """Nothing is done yet; the parts are those of our own loop."""
         self.done = 0
         self.params: Any = None
         self._config = config
@@ -77,14 +78,13 @@ class _Iterations:
     def finish(self, steps: int, metrics: Mapping[str, Any]) -> None:
         """Report an iteration and save it where it is time."""
         jax.effects_barrier()  # the statistics have arrived
-        now = time.monotonic()
+        seconds = time.monotonic() - self._began
         config, size = self._config, self._config.ppo.steps_per_iteration
         stats = jax.tree.map(lambda *parts: np.sum(parts), *self._reports)
         learning = {ours: metrics[theirs] for ours, theirs in LEARNING.items()}
         self.done = steps // size
-        row = make_row(self.done, steps, size, now - self._began, stats, learning)
+        row = make_row(self.done, steps, size, seconds, stats, learning)
         self._reports.clear()
-        self._began = now
         last = self.done == config.num_iterations
         if last or self.done % config.run.log_interval == 0:
             self._logger.add(row)
@@ -102,6 +102,7 @@ class _Iterations:
             raise TrainingFailure(f"{broken}; {self._saver.how_to_continue()}")
         if self._stop.signal and not last:
             raise _Stopped
+        self._began = time.monotonic()
 
 
 def train(
