@@ -36,7 +36,7 @@ from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 
 Figures = dict[str, np.ndarray]
-Make = Callable[[rmp.Robot], Controller]
+Make = Callable[[rmp.Robot], rmp.Controller]
 
 REACHING_LIMIT = 300
 """Policy steps after which an episode of four targets ends (15 s)."""
