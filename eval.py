@@ -11,11 +11,29 @@ from rich.console import Console
 import envs
 from envs import cli
 from rmp_mjx import runtime, sim
-from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate, film, report
 from rmp_mjx.training.learning import networks
 from rmp_mjx.training.runs import policies
 from rmp_mjx.training.runs.checkpoint import CheckpointError
+
+
+def agent_of(
+    options: cli.EvalOptions, config: TrainConfig | None, env, console: Console
+) -> tuple[int, networks.Agent]:
+    """Who acts, and how many iterations of training are behind it."""
+    if options.run and config:
+        return policies.load_agent(
+            env,
+            config,
+            Path(options.run),
+            options.deterministic,
+            console.print,
+            options.seed_index,
+            options.checkpoint,
+        )
+    trivial = {"zero": networks.zero_agent, "random": networks.random_agent}
+    return 0, trivial[options.agent](env.action_size)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -33,26 +51,11 @@ def main(args: Sequence[str] | None = None) -> int:
         console.print(f"trained with other software: {', '.join(newer)}")
     runtime.configure(split_cpu=True)
     env, *others = [envs.make(task) for task in options.tasks]
-    iterations = 0
-    if options.run and config:
-        try:
-            iterations, agent = policies.load_agent(
-                env,
-                config,
-                Path(options.run),
-                options.deterministic,
-                console.print,
-                options.seed_index,
-                options.checkpoint,
-            )
-        except (CheckpointError, ConfigError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2 if isinstance(error, ConfigError) else 1
-    elif options.agent == "zero":
-        agent = networks.zero_agent(env.action_size)
-    else:
-        agent = networks.random_agent(env.action_size)
-
+    try:
+        iterations, agent = agent_of(options, config, env, console)
+    except (CheckpointError, ConfigError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, ConfigError) else 1
     key = jax.random.key(options.seed)
     filmed = film.EPISODES if options.video else 0
     own, tape = evaluate.record_episodes(env, agent, options.episodes, key, filmed)

@@ -50,7 +50,9 @@ TRAINING = {
 TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}
 KNOW_MUJOCO = {"robot", "sim"}
 # where tasks and training meet
-COMMAND_LINE = {"envs.cli", "envs.export", "envs.flags", "envs.grid", "envs.replay"}
+COMMAND_LINE = {
+    f"envs.{name}" for name in ("cli", "export", "flags", "grid", "replay", "results")
+}
 
 
 def modules(package: str) -> list[Path]:

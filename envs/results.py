@@ -1,0 +1,106 @@
+"""What a finished run leaves: curves, evaluation, pictures, policies."""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import polars as pl
+from rich.console import Console
+
+from envs import baselines
+from envs.base import ArmEnv
+from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.evaluation import curves, evaluate, film, report
+from rmp_mjx.training.evaluation.learning_curve import (
+    Baseline,
+    plot_details,
+    plot_learning_curve,
+)
+from rmp_mjx.training.learning import seeds
+from rmp_mjx.training.learning.networks import Agent
+from rmp_mjx.training.runs import distributed, metrics, policies, run_folder
+from rmp_mjx.training.runs.loop import TrainResult
+
+
+def are_complete(config: TrainConfig, folder: Path) -> bool:
+    """Whether a run's folder has all that `finish` writes."""
+    last = run_folder.EVALUATION if config.run.eval_episodes else run_folder.CURVE
+    policy = run_folder.seed_folders(config, folder)[-1] / run_folder.POLICY
+    return (folder / last).exists() and policy.exists()
+
+
+def finish(
+    env: ArmEnv,
+    result: TrainResult,
+    config: TrainConfig,
+    folder: Path,
+    console: Console,
+) -> None:
+    """Plot, evaluate, film and keep every seed's policy; the primary process writes.
+
+    Args:
+        env: The environment that the run was trained in.
+        result: How training ended.
+        config: Configuration of the run.
+        folder: Its folder.
+        console: Terminal.
+    """
+    agent = result.agent
+    primary = distributed.is_primary()
+    if primary:
+        plot(env, config, folder)
+    if config.run.eval_episodes:
+        evaluate_seeds(env, agent, config, folder, console, primary)
+    if primary:
+        evaluated = config.run.eval_episodes > 0
+        policies.save(agent, config, folder, result.iterations, evaluated)
+    console.print(f"results: {folder}", markup=False, highlight=False)
+
+
+def plot(env: ArmEnv, config: TrainConfig, folder: Path) -> None:
+    """The learning curve, and the page of everything else that was recorded."""
+    rows = pl.read_parquet(folder / run_folder.METRICS)
+    if config.ppo.num_seeds > 1:
+        (folder / run_folder.SEEDS).mkdir(exist_ok=True)
+        together = metrics.over_seeds(rows, curves.columns(rows))
+        together.write_parquet(folder / run_folder.SEED_CURVES)
+    found = baselines.rows(config.task)
+    baseline = None
+    if found is not None:
+        label = f"VICES, {found['seed'].n_unique()} seeds, default task"
+        baseline = Baseline(label, found)
+    picture = folder / run_folder.CURVE
+    plot_learning_curve(rows, env.metrics, picture, config.title, baseline)
+    plot_details(rows, env.metrics, folder / run_folder.DETAILS, config.title)
+
+
+def evaluate_seeds(
+    env: ArmEnv,
+    agent: Agent,
+    config: TrainConfig,
+    folder: Path,
+    console: Console,
+    primary: bool,
+) -> None:
+    """Run the evaluation's episodes with every seed's policy; report them."""
+    key = jax.random.key(config.ppo.seed + 1000)
+    filmed = film.EPISODES if config.run.video else 0
+    record = evaluate.recorder(env, config.run.eval_episodes, filmed)
+    about = {"agent": "policy", "deterministic": config.run.eval_deterministic}
+    columns, tapes = [], []
+    for k, place in enumerate(run_folder.seed_folders(config, folder)):
+        results, tape = record(seeds.of_seed(agent, k, config.ppo), key)
+        tapes.append(tape)
+        if primary:
+            found = {env.engine: results}
+            columns.append(report.save(found, env.metrics, about, place, config.title))
+    if not primary:
+        return
+    shown = columns[0]
+    if config.ppo.num_seeds > 1:
+        shown = report.save_over_seeds(columns, about, folder)
+    console.print(report.table(shown, config.title, env.metrics))
+    if config.run.video:
+        from envs.render import render  # loads graphics libraries
+
+        film.publish(partial(render, env), tapes[0], env.dt, folder, console)
