@@ -1,4 +1,4 @@
-"""Set-up shared by every test: XLA flags and one compile cache per test run."""
+"""Set-up shared by every test: XLA flags, a compile cache, checked annotations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
 # `envs` and the scripts live beside the package, not inside it.
@@ -16,6 +17,10 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 _CACHE = "JAX_COMPILATION_CACHE_DIR"
+CONTROLLER = ("rmp", "robot", "control")
+"""Rooms of the controller, of the package and of the tests."""
+CHECKED = [f"rmp_mjx.{name}" for name in (*CONTROLLER, "shapes", "obstacles", "vec")]
+"""Modules whose annotations, shapes included, are checked while the tests run."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -27,6 +32,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if _CACHE not in os.environ:
         os.environ[_CACHE] = tempfile.mkdtemp(prefix="rmp-mjx-test-xla-")
         config.stash[_own_cache] = Path(os.environ[_CACHE])
+
+    # From here on, what these modules take and return is held to its annotations.
+    install_import_hook(CHECKED, "beartype.beartype")
 
     import jax
 
@@ -58,3 +66,13 @@ def robot():
     from rmp_mjx import Robot
 
     return Robot.load()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ranks(request):
+    """In the controller's rooms arrays of different ranks do not mix by accident."""
+    import jax
+
+    strict = request.path.parent.name in CONTROLLER
+    with jax.numpy_rank_promotion("raise" if strict else "allow"):
+        yield
