@@ -12,8 +12,8 @@ from rmp_mjx import runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.runs import distributed
 from rmp_mjx.training.runs.checkpoint import CheckpointError
-from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import TrainingFailure, TrainResult, train
+from rmp_mjx.training.runs.saving import Commands
 
 COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.replay")
 """What messages of a run tell its user to type."""

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rmp_mjx import math as rmath
+from rmp_mjx.xla import materialize
 
 
 @pytest.fixture(scope="module")
@@ -261,3 +262,14 @@ def test_cholesky_and_triangular_solves_agree_with_numpy_in_float64():
         solve = jax.vmap(lambda L, b: rmath.solve_lower(L, b, transposed=True))
         y = jax.jit(solve)(L, wide)
         np.testing.assert_allclose(L.swapaxes(1, 2) @ y, wide, atol=1e-10)
+
+
+RNG = np.random.default_rng(0)
+A, B = (RNG.normal(size=(5, 3)).astype(np.float32) for _ in range(2))
+
+
+def test_a_materialised_array_is_the_same_array_with_the_same_gradient():
+    np.testing.assert_array_equal(materialize(jnp.asarray(A)), A)
+    gradient = jax.grad(lambda x: jnp.sum(materialize(x) * B))(jnp.asarray(A))
+    np.testing.assert_array_equal(gradient, B)
+    assert jax.vmap(materialize)(jnp.asarray(A)).shape == A.shape

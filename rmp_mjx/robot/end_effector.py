@@ -7,8 +7,7 @@ import itertools
 import mujoco
 
 from rmp_mjx.names import unknown
-from rmp_mjx.robot.errors import RobotError
-from rmp_mjx.robot.numbers import Numbers, vector
+from rmp_mjx.robot.errors import Numbers, RobotError, vector
 
 
 def end_effector(

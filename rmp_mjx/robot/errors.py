@@ -2,6 +2,9 @@
 
 import sys
 import warnings
+from collections.abc import Sequence
+
+import numpy as np
 
 
 class RobotError(ValueError):
@@ -19,3 +22,19 @@ def warn(message: str) -> None:
     while frame is not None and frame.f_globals["__name__"].startswith(inside):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RobotWarning, stacklevel=level)
+
+
+Numbers = Sequence[float | int] | np.ndarray
+"""What stands for a vector: a list, a tuple or an array."""
+
+
+def vector(name: str, given: Numbers, size: int) -> np.ndarray:
+    """The numbers as an array (size,).
+
+    Raises:
+        RobotError: They are not that many, or not finite.
+    """
+    x = np.asarray(given, float)
+    if x.shape != (size,) or not np.all(np.isfinite(x)):
+        raise RobotError(f"{name} must be {size} finite numbers, got {x.tolist()}")
+    return x

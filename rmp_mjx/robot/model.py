@@ -22,7 +22,7 @@ from rmp_mjx.robot.control_points import (
     touching_pairs,
 )
 from rmp_mjx.robot.end_effector import end_effector
-from rmp_mjx.robot.errors import RobotError
+from rmp_mjx.robot.errors import Numbers, RobotError, vector
 from rmp_mjx.robot.fingerprint import fingerprint
 from rmp_mjx.robot.links import carriers, frame_with_z, lumped_inertias, segments
 from rmp_mjx.robot.mjcf import (
@@ -35,7 +35,6 @@ from rmp_mjx.robot.mjcf import (
     remove_gravity_compensation,
 )
 from rmp_mjx.robot.motors import make_motors
-from rmp_mjx.robot.numbers import Numbers, vector
 from rmp_mjx.robot.passive import PassiveForces, passive_forces
 from rmp_mjx.robot.posture import nominal_posture
 from rmp_mjx.types import Constant

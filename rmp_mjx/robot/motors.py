@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from rmp_mjx.robot.errors import RobotError, warn
-from rmp_mjx.robot.numbers import Numbers, vector
+from rmp_mjx.robot.errors import Numbers, RobotError, vector, warn
 
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rmp_mjx.robot.errors import RobotError, warn
-from rmp_mjx.robot.numbers import Numbers, vector
+from rmp_mjx.robot.errors import Numbers, RobotError, vector, warn
 
 CLOSE = 0.1
 """Part of a joint's range, at either end, that a chosen posture keeps out of."""

@@ -9,8 +9,8 @@ from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.checkpoint import Checkpointer
-from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import train
+from rmp_mjx.training.runs.saving import Commands
 from tests.training import toys
 
 SMALL = {

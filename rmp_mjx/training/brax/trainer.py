@@ -14,17 +14,15 @@ from rmp_mjx.training.brax.arguments import NOT_IN_BRAX, arguments
 from rmp_mjx.training.brax.environment import Batch
 from rmp_mjx.training.brax.replicated import device_put_replicated
 from rmp_mjx.training.config import ConfigError, TrainConfig
-from rmp_mjx.training.learning.learner import Learner
+from rmp_mjx.training.learning.learner import Learner, TrainState
 from rmp_mjx.training.learning.networks import make_agent
 from rmp_mjx.training.learning.rollout import Env, RolloutStats
-from rmp_mjx.training.learning.state import TrainState
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.checkpoint import Checkpointer
-from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.loop import TrainResult
 from rmp_mjx.training.runs.metrics import make_row
-from rmp_mjx.training.runs.saving import Saver
+from rmp_mjx.training.runs.saving import Commands, Saver
 from rmp_mjx.training.runs.stopping import StopRequest, TrainingFailure
 from rmp_mjx.training.runs.trackers import open_trackers
 from rmp_mjx.training.runs.watch import Watch

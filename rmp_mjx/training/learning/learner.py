@@ -6,11 +6,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from brax.training.acme import running_statistics
 from brax.training.agents.ppo.networks import PPONetworks
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import PPOConfig
+from rmp_mjx.training.learning.rollout import RolloutState
+from rmp_mjx.training.learning.value_scale import ValueScale
 
 EPSILON = 1e-5
 """Adam's term against division by zero."""
@@ -102,3 +105,20 @@ def _step(
     updates, new_opt = optimizer.update(grad, opt, params)
     new = optax.apply_updates(params, updates), new_opt
     return jax.tree.map(lambda n, o: jnp.where(may, n, o), new, (params, opt))
+
+
+class TrainState(Pytree):
+    """Everything that training carries from one iteration to the next."""
+
+    learner: Learner
+    """Networks and optimizers."""
+    normalizer: running_statistics.RunningStatisticsState
+    """Observation statistics."""
+    scale: ValueScale
+    """Scale of the value targets."""
+    rollout: RolloutState
+    """Environments and unfinished episodes."""
+    key: PRNGKeyArray
+    """Source of all further randomness."""
+    iteration: Int[Array, ""]
+    """Finished iterations."""

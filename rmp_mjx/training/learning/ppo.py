@@ -25,14 +25,18 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices, rollout, value_scale
-from rmp_mjx.training.learning.learner import Learner, Optimizers, make_optimizers
+from rmp_mjx.training.learning.advantages import Metrics, make_batch
+from rmp_mjx.training.learning.learner import (
+    Learner,
+    Optimizers,
+    TrainState,
+    make_optimizers,
+)
 from rmp_mjx.training.learning.networks import (
     distribution,
     make_networks,
     sample_action,
 )
-from rmp_mjx.training.learning.state import TrainState
-from rmp_mjx.training.learning.targets import Metrics, make_batch
 from rmp_mjx.training.learning.update import Update, in_groups
 from rmp_mjx.trees import cast_like
 

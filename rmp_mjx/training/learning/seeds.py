@@ -14,9 +14,9 @@ from jaxtyping import Array, Key
 
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices
+from rmp_mjx.training.learning.learner import TrainState
 from rmp_mjx.training.learning.ppo import PPO, make_ppo
 from rmp_mjx.training.learning.rollout import Env
-from rmp_mjx.training.learning.state import TrainState
 
 
 class Programs(NamedTuple):

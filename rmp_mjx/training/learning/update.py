@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices
+from rmp_mjx.training.learning.advantages import Metrics
 from rmp_mjx.training.learning.learner import Learner, Optimizers
 from rmp_mjx.training.learning.loss import Batch, ppo_loss
-from rmp_mjx.training.learning.targets import Metrics
 
 KL_TOLERANCE = 1.5
 """The policy stops beyond this many times the target KL."""

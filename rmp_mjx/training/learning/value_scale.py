@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.pytree import Pytree
-from rmp_mjx.training.learning.weighted import weighted_mean
+from rmp_mjx.training.learning.loss import weighted_mean
 
 SLOWEST_RATE = 0.05
 """Weight of an iteration's targets in the running moments, once many have passed."""

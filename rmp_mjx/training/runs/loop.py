@@ -13,12 +13,12 @@ from rmp_mjx.training.runs import distributed, identity, run_folder
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.runs.commands import Commands
+from rmp_mjx.training.runs.saving import Commands
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.metrics import Row, make_rows
 from rmp_mjx.training.learning.networks import Agent, make_agent
 from rmp_mjx.training.learning.ppo import make_ppo
-from rmp_mjx.training.learning.state import TrainState
+from rmp_mjx.training.learning.learner import TrainState
 from rmp_mjx.training.learning.rollout import Env
 from rmp_mjx.training.runs.saving import Saver
 from rmp_mjx.training.runs.stopping import StopRequest, TrainingFailure

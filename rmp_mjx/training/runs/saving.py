@@ -2,14 +2,29 @@
 
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rmp_mjx.training.runs import run_folder
-from rmp_mjx.training.runs.commands import Commands, then
 from rmp_mjx.training.runs.checkpoint import MERITS, Checkpointer, SaveError
 from rmp_mjx.training.runs.metrics import Row
 from rmp_mjx.training.runs.stopping import TrainingFailure
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What a user types next; None: the application has no such command."""
+
+    resume: str | None = None
+    """Continues a run. The run's folder follows, as in `python train.py --resume`."""
+    replay: str | None = None
+    """Replays a non-finite step. A file of `faults.dump` follows."""
+
+
+def then(purpose: str, command: str | None, path: Path) -> str:
+    """The end of a message: a purpose and its command; nothing without a command."""
+    return f"; {purpose}\n  {command} {path}" if command else ""
 
 
 class Saver:

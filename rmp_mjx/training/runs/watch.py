@@ -10,9 +10,9 @@ from rmp_mjx.metric import Metric
 from rmp_mjx.training.learning import faults, seeds
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.runs.commands import Commands, then
+from rmp_mjx.training.runs.saving import Commands, then
 from rmp_mjx.training.runs.metrics import SEED, Row
-from rmp_mjx.training.learning.state import TrainState
+from rmp_mjx.training.learning.learner import TrainState
 
 MAX_LOST_FRACTION = 0.5
 """Training stops if a larger share of an iteration's steps becomes non-finite."""

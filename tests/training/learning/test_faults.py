@@ -12,8 +12,8 @@ from rmp_mjx.metric import Metric, by_name
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import run_folder, watch
-from rmp_mjx.training.runs.commands import Commands
 from rmp_mjx.training.runs.loop import train
+from rmp_mjx.training.runs.saving import Commands
 from tests.training import toys
 from tests.training.conftest import SMALL, bits, small
 

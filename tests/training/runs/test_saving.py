@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from rmp_mjx.training.runs.commands import Commands
+from rmp_mjx.training.runs.saving import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer, SaveError
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.metrics import Row
@@ -131,7 +131,7 @@ import io, sys
 from pathlib import Path
 from rich.console import Console
 from rmp_mjx import runtime
-from rmp_mjx.training.runs.commands import Commands
+from rmp_mjx.training.runs.saving import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.stopping import TrainingFailure
 from tests.training.conftest import run
