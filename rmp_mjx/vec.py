@@ -19,11 +19,11 @@ from rmp_mjx.pytree import Constant, Pytree
 class Vec(Pytree):
     """A 3-vector field; the components have one shape, or broadcast."""
 
-    x: Constant | float
+    x: Constant
     """First component."""
-    y: Constant | float
+    y: Constant
     """Second component."""
-    z: Constant | float
+    z: Constant
     """Third component."""
 
     @classmethod

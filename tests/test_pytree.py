@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +17,8 @@ from rmp_mjx.pytree import Pytree
 class Gain(Pytree):
     """A number, with a static name."""
 
-    value: float = 1.0
-    name: str = struct.field(pytree_node=False, default="gain")
+    value: Any = 1.0
+    name: Any = struct.field(pytree_node=False, default="gain")
 
     def __call__(self, x):
         return self.value * x
@@ -26,15 +27,15 @@ class Gain(Pytree):
 class Pair(Pytree):
     """Nested pytrees, an array and anything else."""
 
-    gain: Gain
-    array: np.ndarray
-    more: object = None
+    gain: Any
+    array: Any
+    more: Any = None
 
 
 class Strict(Pytree):
     """Fills in a default, and checks what a user passes."""
 
-    value: float | None = None
+    value: Any = None
 
     def __post_init__(self):
         if self.value is None:
@@ -50,7 +51,7 @@ def pair(**changes):
 def test_a_subclass_is_a_frozen_dataclass():
     assert dataclasses.is_dataclass(Pair)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        pair().gain = Gain()
+        setattr(pair(), "gain", Gain())  # noqa: B010
     assert pair().replace(gain=Gain(3.0)).gain.value == 3.0
 
 

@@ -3,6 +3,7 @@
 import copy
 import inspect
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ def changed(tree, **fields):
     return tree
 
 
-def call(ctrl, q=Q, qd=Q, obstacles=SLOTS, **fields):
+def call(ctrl, q: Any = Q, qd: Any = Q, obstacles: Any = SLOTS, **fields):
     """Trace the controller with these arguments and fields of the set-point."""
     setpoint = changed(ctrl.setpoint(Q, ACTION, 0.0), **fields)
     return jax.eval_shape(lambda: ctrl(q, qd, setpoint, obstacles))
@@ -124,7 +125,7 @@ def test_the_checks_leave_no_trace_in_the_program(robot):
 
 
 def test_an_action_and_a_set_point_are_not_confused(robot):
-    ctrl = VICES(robot)
+    ctrl: Any = VICES(robot)
     with pytest.raises(ValueError, match=r"action must be an Action, got ndarray"):
         ctrl.setpoint(Q, np.zeros(12), 0.0)
     with pytest.raises(ValueError, match=r"action\.drot must be .* got float64 \(4,\)"):

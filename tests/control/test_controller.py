@@ -1,5 +1,7 @@
 """Every controller fulfils the protocol and answers in the same form."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -47,7 +49,7 @@ def test_a_controller_of_ones_own_needs_no_base_class(robot):
 
 
 def test_the_time_of_the_policy_step_must_be_given(robot):
-    ctrl = VICES(robot)
+    ctrl: Any = VICES(robot)
     action = ctrl.decode(jnp.zeros(12))
     with pytest.raises(TypeError, match="'time'"):
         ctrl.setpoint(jnp.zeros(3), action)

@@ -3,6 +3,7 @@
 import copy
 import functools
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -207,7 +208,7 @@ def test_a_scan_of_the_jitted_controller_gives_its_torque(small, near):
     np.testing.assert_allclose(scanned, [tau, tau], rtol=1e-4, atol=1e-4)
 
 
-def test_a_gradient_by_the_controller_is_a_controller(small, near):
+def test_a_gradient_by_the_controller_is_a_controller(small: Any, near):
     """Every parameter's derivative, at its place."""
     q, qd, action = (jnp.asarray(x) for x in STATE)
     leaves = small.leaves.replace(self_collision=None)
@@ -222,7 +223,8 @@ def test_a_gradient_by_the_controller_is_a_controller(small, near):
     found = slope(ctrl)
     assert type(found) is RMPVICES
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(found))
-    assert found.regularizer != 0.0 and found.leaves.posture.kq != 0.0
+    assert found.regularizer != 0.0
+    assert found.leaves.posture is not None and found.leaves.posture.kq != 0.0
 
 
 def test_controllers_are_compared_by_value(small):

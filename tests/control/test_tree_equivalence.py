@@ -1,6 +1,7 @@
 """The fast evaluation against the tree that defines it, in float64."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +63,7 @@ def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):
     """To rounding: 1e-9 of the largest entry."""
     near, n = collision_near(), len(robot.points.segment)
     each = {"boxes": near, "planes": near.replace(mu=np.full(n, near.mu))}
-    split = RMPVICES(robot).with_collision(each)
+    split: Any = RMPVICES(robot).with_collision(each)
     assert split.leaves.collision["spheres"] == near
     for k in range(3):
         q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
