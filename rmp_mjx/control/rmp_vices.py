@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,8 @@ from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_state
 from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.xla import materialize
 
+_DEFAULT: Any = None  # stands for leaves that depend on the robot
+
 
 class RMPVICES(ImpedanceController):
     r"""Variable-impedance control as the attractor of an RMP-tree (paper, section III).
@@ -43,7 +46,7 @@ class RMPVICES(ImpedanceController):
     parameters are array leaves that can be traced, vmapped, differentiated and tuned.
     """
 
-    leaves: Leaves = struct.field(default=None)
+    leaves: Leaves = struct.field(default=_DEFAULT)
     """The safety leaves and the posture; `Leaves.default(robot)` if not given."""
     attractor_weight: Float[Constant, ""] | float = 1.0
     """Metric of the two impedance attractors."""
