@@ -12,9 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from benchmarks.paper import measures, pictures, targets
-from benchmarks.paper.cells import PAPER, TASKS, VARIANTS, Cell
-from benchmarks.paper.columns import COLUMNS, TABLE
+from benchmarks.paper import deployment, measures, targets
+from benchmarks.paper.cells import COLUMNS, PAPER, TABLE, TASKS, VARIANTS, Cell
 from benchmarks.paper.store import Store
 from benchmarks.png import save_figure
 
@@ -217,7 +216,7 @@ def instances(place: Store, path: Path) -> bool:
     for task, title in TASKS.items():
         cell = best_cell(place, task, targets.OURS)
         if cell:
-            images.append((title, pictures.folder(place, cell) / pictures.INSTANCE))
+            images.append((title, deployment.folder(place, cell) / deployment.INSTANCE))
     return montage(images, path, 3)
 
 
@@ -227,7 +226,7 @@ def storyboard(place: Store, path: Path, task: str) -> bool:
     for variant in PAPER:
         cell = best_cell(place, task, variant)
         if cell:
-            image = pictures.folder(place, cell) / pictures.STORYBOARD
+            image = deployment.folder(place, cell) / deployment.STORYBOARD
             images.append((VARIANTS[variant].label, image))
     return montage(images, path, 1)
 
@@ -241,6 +240,6 @@ def failures(place: Store, path: Path, events: pl.DataFrame) -> bool:
             continue
         rows = measures.of(events, task=task, variant=cell.variant, seed=cell.seed)
         for number, row in enumerate(rows.iter_rows(named=True)):
-            still = pictures.folder(place, cell) / pictures.failure(number)
+            still = deployment.folder(place, cell) / deployment.failure(number)
             images.append((f"{title}: {row['first']} and {row['second']}", still))
     return montage(images, path, 3)

@@ -20,8 +20,7 @@ from typing import Any
 import polars as pl
 import polars.selectors as cs
 
-from benchmarks.paper.cells import Cell
-from benchmarks.paper.columns import PICTURED
+from benchmarks.paper.cells import PICTURED, Cell
 from rmp_mjx.files import replacing
 
 KEY = "rmp_mjx"

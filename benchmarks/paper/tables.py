@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from benchmarks.paper import measures, published, store, targets
-from benchmarks.paper.cells import PAPER, TASKS, VARIANTS
-from benchmarks.paper.columns import COLUMNS
-from benchmarks.paper.page import Table
+from benchmarks.paper import measures, store, targets
+from benchmarks.paper.cells import COLUMNS, PAPER, TASKS, VARIANTS
+from benchmarks.paper.report import Table
 from benchmarks.paper.store import Store
 from rmp_mjx.training.stats import Interval
 
@@ -63,8 +62,8 @@ def training(place: Store) -> Table:
     """Areas under the training curves and their change, beside the paper's."""
     names = {
         "return": ("episode/return", {}),
-        "collisions": ("episode/collision", published.TRAINING_DROP["collision"]),
-        "joint limits": ("episode/joint_limit", published.TRAINING_DROP["joint_limit"]),
+        "collisions": ("episode/collision", targets.TRAINING_DROP["collision"]),
+        "joint limits": ("episode/joint_limit", targets.TRAINING_DROP["joint_limit"]),
     }
     lines = []
     for task, title in TASKS.items():
@@ -135,7 +134,7 @@ def deployment(place: Store, column: str) -> Table:
             for name in ("collision", "joint_limit", "success"):
                 rate = measures.rate(rows, name)
                 cells.append(f"{rate.percent:.1f} {interval(rate.interval)}")
-            paper = published.DEPLOYMENT.get(variant, {}).get(task)
+            paper = targets.DEPLOYMENT.get(variant, {}).get(task)
             cells.append(
                 f"{paper.mean:,.0f} ± {paper.sd:,.0f}; {paper.collision}; "
                 f"{paper.joint_limit}"
@@ -294,7 +293,7 @@ def reproduction(place: Store, column: str) -> Table:
             ("collision", "collisions"),
             ("joint_limit", "joint limits"),
         ):
-            drop = published.TRAINING_DROP[name][task]
+            drop = targets.TRAINING_DROP[name][task]
             found = targets.change(rows, f"episode/{name}")
             if drop is None or found is None or not np.isfinite(found[0]):
                 continue
@@ -312,7 +311,7 @@ def reproduction(place: Store, column: str) -> Table:
         )
         if ours is None or base is None:
             continue
-        theirs = [published.DEPLOYMENT[v][task] for v in (targets.BASE, targets.OURS)]
+        theirs = [targets.DEPLOYMENT[v][task] for v in (targets.BASE, targets.OURS)]
         for name, label in (
             ("collision", "collisions"),
             ("joint_limit", "joint limits"),

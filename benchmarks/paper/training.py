@@ -11,7 +11,7 @@ from typing import Any
 import polars as pl
 from rich.console import Console
 
-from benchmarks.paper import cells, store, tasks
+from benchmarks.paper import cells, store
 from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.store import Store
 from rmp_mjx.training.config import (
@@ -125,4 +125,4 @@ def _run(
     )
     folder, lock = run_folder.open_run(config)
     with lock:
-        return train(tasks.load(config), config, folder, console)
+        return train(cells.load(config), config, folder, console)

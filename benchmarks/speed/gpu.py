@@ -35,7 +35,7 @@ import numpy as np
 import envs
 import rmp_mjx as rmp
 from benchmarks.common import Row, Timing, show, time_calls, write_json
-from benchmarks.paper import tasks
+from benchmarks.paper import cells
 from benchmarks.paper.cells import PRESETS, Cell, Preset
 from envs.scene import TABLE_HEIGHT
 from rmp_mjx import runtime, sim
@@ -230,7 +230,7 @@ def training(
 def cell(programs: Programs, physics: str, preset: Preset, own: Cell) -> Part:
     """All seeds of a cell of the paper's grid in one program, for some iterations."""
     config = preset.config(own).replace(physics=physics, num_seeds=preset.seeds)
-    env = tasks.load(config)
+    env = cells.load(config)
     ppo, keys = make_ppo(env, config.ppo), seeds.keys(config.ppo)
     start = programs.add(jax.vmap(ppo.init), keys).result()[0](keys)
     step, compile_s = programs.add(jax.vmap(ppo.iterate), start).result()

@@ -25,18 +25,14 @@ from benchmarks.paper import (
     deployment,
     failures,
     measures,
-    pictures,
-    published,
     report,
     store,
     tables,
     targets,
-    tasks,
     training,
     work,
 )
-from benchmarks.paper.cells import PAPER, PRESETS, TASKS, Cell
-from benchmarks.paper.columns import COLUMNS
+from benchmarks.paper.cells import COLUMNS, PAPER, PRESETS, TASKS, Cell
 from benchmarks.paper.store import Store
 from envs.cli import make_config
 from envs.flags import load_config
@@ -105,9 +101,9 @@ def toy():
     """Every task is the toy; nothing is drawn; events are not looked into."""
     risk = {"vices": 0.3, "rmp_vices": 0.02}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tasks, "load", lambda config: Arm(risk[config.task.controller]))
+        patch.setattr(cells, "load", lambda config: Arm(risk[config.task.controller]))
         patch.setattr(failures, "describe", lambda env, results, tape: [EVENT])
-        patch.setattr(pictures, "save", lambda *args: None)
+        patch.setattr(deployment, "save", lambda *args: None)
         deployment._world.cache_clear()
         yield
         deployment._world.cache_clear()
@@ -356,7 +352,7 @@ def test_the_page_holds_every_target_and_every_figure(grid, page):
 
 def test_the_page_has_the_papers_numbers_beside_ours(grid, page):
     text = page.read_text()
-    paper = published.DEPLOYMENT["vices"]["door"]
+    paper = targets.DEPLOYMENT["vices"]["door"]
     best = targets.best(grid[0], "door", "vices", "close")
     assert best is not None
     hits = int((best["collision"] > 0).sum())
