@@ -81,7 +81,7 @@ def test_the_commands_of_the_documents_exist(document, command):
         target = next(w for w in words[1:] if "=" not in w)
         makefile = (ROOT / "Makefile").read_text()
         assert re.search(rf"^{re.escape(target)}:", makefile, re.M), target
-    elif words[0] == "python":
+    elif words[0] in ("python", ".venv/bin/python"):
         if words[1] == "-m":
             assert importlib.util.find_spec(words[2]), f"no module {words[2]}"
             if not words[2].startswith("benchmarks"):
