@@ -10,7 +10,7 @@ import numpy as np
 from envs.placement import Layout
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
-from rmp_mjx.control.osc import OSC
+from rmp_mjx.control.vices import OSC
 from rmp_mjx.names import unknown
 
 ControllerName = Literal["rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf"]

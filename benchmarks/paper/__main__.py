@@ -10,7 +10,7 @@ from typing import Literal
 
 from rich.console import Console
 
-from benchmarks.paper import cells, report, work
+from benchmarks.paper import cells, report, training
 from benchmarks.paper.cells import PRESETS, Cell
 from benchmarks.paper.store import Store
 from envs.flags import parse
@@ -61,7 +61,7 @@ def main(args: Sequence[str] | None = None) -> int:
             wanted = [cells.parse(options.only)]
         if not options.report:
             runtime.configure(split_cpu=True)
-            code = work.run(
+            code = training.run(
                 place, preset, wanted, console, options.seconds, options.allow_changes
             )
         if options.only:

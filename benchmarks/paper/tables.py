@@ -7,7 +7,7 @@ import polars as pl
 
 from benchmarks.paper import measures, store, targets
 from benchmarks.paper.cells import COLUMNS, PAPER, TASKS, VARIANTS
-from benchmarks.paper.report import Table
+from benchmarks.paper.page import Table
 from benchmarks.paper.store import Store
 from rmp_mjx.training.stats import Interval
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from brax.envs.base import Env  # pyright: ignore[reportMissingImports]
-from brax.training.agents.ppo import (  # pyright: ignore[reportMissingImports]
+from brax.envs.base import Env
+from brax.training.agents.ppo import (
     networks,
     train,
 )
@@ -46,7 +46,7 @@ class PointTask(Env):
         """Start somewhere."""
         return Point.start(rng, {})
 
-    def step(self, state, action):
+    def step(self, state: Any, action):
         """One step."""
         return state.step(action)
 

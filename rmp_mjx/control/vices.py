@@ -14,7 +14,7 @@ from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, site_state
-from rmp_mjx.types import ControlOutput, Setpoint
+from rmp_mjx.types import Action, ControlOutput, Setpoint
 
 
 class VICES(ImpedanceController):
@@ -86,3 +86,20 @@ class VICES(ImpedanceController):
 
 def _dot(a: Array, b: Array) -> Array:
     return jnp.matmul(a, b, precision="highest")
+
+
+class OSC(VICES):
+    """VICES whose policy moves the set-point only.
+
+    The stiffness entries of an action are ignored. Actions keep their size, so that the
+    same policy network fits. The stiffness is that of robosuite's OSC_POSE controller.
+    """
+
+    kp: Float[Constant, ""] | float = 150.0
+    """Stiffness in every direction [1/s^2]."""
+
+    def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
+        """Physical units of a policy action in [-1, 1]^12."""
+        free = super().decode(action)
+        held = jnp.full_like(free.kp_pos, self.kp)
+        return free.replace(kp_pos=held, kp_ori=held)

@@ -13,8 +13,8 @@ from jaxtyping import jaxtyped
 
 from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
-from rmp_mjx.control.osc import OSC
 from rmp_mjx.control.tree import rmp_vices_tree
+from rmp_mjx.control.vices import OSC
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp import TaskMap, pushforward
 from rmp_mjx.robot.dynamics import dynamics

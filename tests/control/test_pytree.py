@@ -12,7 +12,7 @@ import pytest
 
 from rmp_mjx import RMPVICES, VICES, Leaves, Obstacles, Robot, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
-from rmp_mjx.control.osc import OSC
+from rmp_mjx.control.vices import OSC
 from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 

@@ -21,7 +21,7 @@ from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.learning.learner import TrainState
 from rmp_mjx.training.learning.rollout import Env
 from rmp_mjx.training.runs.saving import Saver
-from rmp_mjx.training.runs.stopping import StopRequest, TrainingFailure
+from rmp_mjx.training.runs.saving import StopRequest, TrainingFailure
 from rmp_mjx.training.runs.trackers import open_trackers
 from rmp_mjx.training.runs.watch import Watch, is_finite
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 import envs
-from benchmarks.paper import failures, measures
+from benchmarks.paper import deployment, measures
 
 
 def rows(values, seed=0, name="episode/collision", finished=1):
@@ -145,7 +145,7 @@ def test_events_are_put_down_to_what_is_nearest():
         "contact_force_peak": np.array([33.0, 0.0]),
     }
     hit, limit = pl.DataFrame(
-        failures.describe(env, results, tape), failures.SCHEMA
+        deployment.describe(env, results, tape), deployment.SCHEMA
     ).iter_rows(named=True)
     assert (hit["first"], hit["second"]) == ("arm/fingers", "sphere_1")
     assert (hit["hand"], hit["force"], hit["step"]) == (True, 33.0, 3)

@@ -23,14 +23,12 @@ from benchmarks.paper import (
     __main__,
     cells,
     deployment,
-    failures,
     measures,
     report,
     store,
     tables,
     targets,
     training,
-    work,
 )
 from benchmarks.paper.cells import COLUMNS, PAPER, PRESETS, TASKS, Cell
 from benchmarks.paper.store import Store
@@ -102,7 +100,7 @@ def toy():
     risk = {"vices": 0.3, "rmp_vices": 0.02}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cells, "load", lambda config: Arm(risk[config.task.controller]))
-        patch.setattr(failures, "describe", lambda env, results, tape: [EVENT])
+        patch.setattr(deployment, "describe", lambda env, results, tape: [EVENT])
         patch.setattr(deployment, "save", lambda *args: None)
         deployment._world.cache_clear()
         yield
@@ -127,7 +125,7 @@ def grid(toy, tmp_path_factory):
     place = Store(tmp_path_factory.mktemp("paper"))
     said = tmp_path_factory.mktemp("log") / "log"
     with said.open("w") as file:
-        code = work.run(place, TINY, TINY.cells(), Console(file=file, width=200))
+        code = training.run(place, TINY, TINY.cells(), Console(file=file, width=200))
     assert code == 0
     return Store(place.folder), said.read_text()
 
@@ -148,7 +146,7 @@ def test_a_round_is_one_seed_of_all_six_cells():
     everything = preset.cells(baselines=True)
     assert everything[: len(wanted)] == wanted
     assert {c.variant for c in everything[len(wanted) :]} == set(cells.BASELINES)
-    ordered = work.steps(preset, wanted)
+    ordered = training.steps(preset, wanted)
     columns = len(preset.columns)
     assert all(step.column is None for step in ordered[:6])
     assert all(step.column for step in ordered[6 : 6 + 6 * columns])
@@ -225,8 +223,8 @@ def test_finished_work_is_not_repeated(grid, monkeypatch):
     def refuse(*args):
         pytest.fail("something was done again")
 
-    monkeypatch.setattr(work, "_do", refuse)
-    assert work.run(Store(grid[0].folder), TINY, TINY.cells(), QUIET) == 0
+    monkeypatch.setattr(training, "_do", refuse)
+    assert training.run(Store(grid[0].folder), TINY, TINY.cells(), QUIET) == 0
 
 
 def test_a_damaged_part_is_made_anew_and_a_changed_one_too(grid):
@@ -261,15 +259,15 @@ def test_a_packed_store_of_other_settings_is_refused(grid, tmp_path):
     grid[0].pack(tmp_path)
     other = dataclasses.replace(TINY, training=TINY.training.replace(gae_lambda=0.5))
     with pytest.raises(ConfigError, match=r"gae_lambda: 0\.97 -> 0\.5"):
-        work.run(Store(tmp_path), other, other.cells(), QUIET)
+        training.run(Store(tmp_path), other, other.cells(), QUIET)
 
 
 def test_a_run_of_other_settings_is_refused_before_anything_starts(grid, monkeypatch):
-    monkeypatch.setattr(work, "_do", lambda *args: pytest.fail("started"))
+    monkeypatch.setattr(training, "_do", lambda *args: pytest.fail("started"))
     other = TINY.training.replace(learning_rate=1e-3)
     other = dataclasses.replace(TINY, training=other)
     with pytest.raises(ConfigError, match=r"learning_rate: 0\.0003 -> 0\.001"):
-        work.run(Store(grid[0].folder), other, other.cells(), QUIET)
+        training.run(Store(grid[0].folder), other, other.cells(), QUIET)
 
 
 def test_a_stopped_grid_goes_on_to_the_same_bits(grid, toy, tmp_path, monkeypatch):
@@ -287,10 +285,10 @@ def test_a_stopped_grid_goes_on_to_the_same_bits(grid, toy, tmp_path, monkeypatc
 
     monkeypatch.setattr(saving.Saver, "save", save)
     wanted = [cell]
-    assert work.run(place, TINY, wanted, QUIET) == 128 + signal.SIGTERM
+    assert training.run(place, TINY, wanted, QUIET) == 128 + signal.SIGTERM
     assert 0 < max(saves) < 4
     assert not place.holds(cells.definition(TINY, cell), store.TRAINING, cell)
-    assert work.run(Store(tmp_path), TINY, wanted, QUIET) == 0
+    assert training.run(Store(tmp_path), TINY, wanted, QUIET) == 0
     values = [
         measures.of(
             Store(p.folder).training, task=cell.task, variant=cell.variant, seed=0
@@ -317,7 +315,7 @@ def test_a_run_whose_checkpoints_are_lost_begins_anew(grid, toy, tmp_path):
     damaged.mkdir(parents=True)
     (damaged / "_CHECKPOINT_METADATA").write_text("nonsense")
     lock.close()
-    assert work.run(place, TINY, [cell], QUIET) == 0
+    assert training.run(place, TINY, [cell], QUIET) == 0
     assert len(Store(tmp_path).training) == 4
 
 
@@ -325,10 +323,10 @@ def test_the_time_given_ends_in_a_signal():
     stopped = threading.Event()
     previous = signal.signal(signal.SIGTERM, lambda *_: stopped.set())
     try:
-        with work._alarm(0.01):
+        with training._alarm(0.01):
             assert stopped.wait(10.0)
         stopped.clear()
-        with work._alarm(3600.0):
+        with training._alarm(3600.0):
             pass
         assert not stopped.is_set()
     finally:
@@ -384,11 +382,11 @@ def test_the_page_and_its_figures_are_the_same_from_a_packed_store(
 def test_what_is_packed_is_done_and_a_new_part_comes_before_it(
     grid, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(work, "_do", lambda *args: pytest.fail("done again"))
+    monkeypatch.setattr(training, "_do", lambda *args: pytest.fail("done again"))
     grid[0].pack(tmp_path)
     place, cell = Store(tmp_path), Cell("door", "vices", 0)
     assert place.provenance == grid[0].provenance
-    assert work.run(place, TINY, TINY.cells(), QUIET) == 0
+    assert training.run(place, TINY, TINY.cells(), QUIET) == 0
     rows = measures.of(grid[0].episodes, task="door", variant="vices", seed=0)
     rows = rows.filter(column="free").with_columns(pl.lit(7.0).alias("return"))
     place.write(rows, {"definition": {"episodes": 5}}, store.EPISODES, cell, "free")

@@ -1,5 +1,6 @@
 """A run of Brax's trainer: its folder, its policy, and a stop."""
 
+import inspect
 import io
 import os
 import signal
@@ -10,16 +11,18 @@ import numpy as np
 import polars as pl
 import pytest
 from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as brax_ppo
 from rich.console import Console
 
-from rmp_mjx.training.brax import arguments, trainer
-from rmp_mjx.training.config import read_record
+from rmp_mjx.training.brax import trainer
+from rmp_mjx.training.brax.replicated import NAME, device_put_replicated
+from rmp_mjx.training.config import ConfigError, TrainConfig, read_record
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.learning import rollout
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.policies import load_agent
-from rmp_mjx.training.runs.stopping import TrainingFailure
+from rmp_mjx.training.runs.saving import TrainingFailure
 from tests.training import toys
 from tests.training.conftest import ITERATIONS, SMALL, small
 
@@ -68,14 +71,14 @@ def test_a_run_leaves_the_same_folder_as_our_own_loop(trained, finished):
 
 def test_what_brax_does_not_use_is_said_once(trained):
     said = trained[3]
-    assert all(said.count(name) == 1 for name in arguments.NOT_IN_BRAX)
+    assert all(said.count(name) == 1 for name in trainer.NOT_IN_BRAX)
     assert "reward_scaling" in said
 
 
 def test_the_policy_acts_as_braxs_own_and_is_read_from_the_folder(trained):
     folder, result, config, _, params = trained
     env = toys.Counter()
-    networks = arguments.arguments(env, config)["network_factory"]()
+    networks = trainer.arguments(env, config)["network_factory"]()
     brax_policy = ppo_networks.make_inference_fn(networks)(params, deterministic=True)
     obs, key = jax.random.normal(jax.random.key(1), (5, 3)), jax.random.key(2)
     wanted = np.clip(brax_policy(obs, key)[0], -1.0, 1.0)
@@ -122,3 +125,125 @@ def test_losses_that_become_nonfinite_end_it_unsaved(tmp_path, monkeypatch):
     with pytest.raises(TrainingFailure, match="non-finite; nothing is saved"):
         run(tmp_path / "run")
     assert not list((tmp_path / "run" / run_folder.CHECKPOINTS).glob("[0-9]*"))
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """A JAX that does not have the function, as the locked one."""
+    monkeypatch.delattr(jax, NAME, raising=False)
+
+
+def test_it_is_there_inside_the_context_alone(without):
+    with device_put_replicated():
+        assert hasattr(jax, NAME)
+    assert not hasattr(jax, NAME)
+
+
+def test_it_is_gone_after_an_error_too(without):
+    with pytest.raises(KeyError), device_put_replicated():
+        raise KeyError
+    assert not hasattr(jax, NAME)
+
+
+def test_a_jax_that_has_it_keeps_its_own(monkeypatch):
+    own = object()
+    monkeypatch.setattr(jax, NAME, own, raising=False)
+    with device_put_replicated():
+        assert getattr(jax, NAME) is own
+    assert getattr(jax, NAME) is own
+
+
+def test_each_device_gets_a_copy_that_pmap_takes(without):
+    devices = jax.local_devices()[:2]
+    tree = {"a": jnp.arange(3.0), "b": 7}
+    with device_put_replicated():
+        copies = getattr(jax, NAME)(tree, devices)
+    sums = jax.pmap(lambda t: t["a"].sum() + t["b"], devices=devices)(copies)
+    assert sums.tolist() == [10.0] * len(devices)
+    assert {s.device for s in copies["a"].addressable_shards} == set(devices)
+
+
+CONFIG = TrainConfig(toys.Options(), trainer="brax").replace(
+    num_envs=24,
+    num_timesteps=1000,
+    seed=3,
+    unroll_length=8,
+    num_minibatches=4,
+    num_updates_per_batch=5,
+    discounting=0.98,
+    gae_lambda=0.9,
+    learning_rate=2e-4,
+    clipping_epsilon=0.3,
+    entropy_cost=1e-3,
+    vf_coefficient=0.7,
+    max_grad_norm=0.4,
+    target_kl=0.03,
+    reward_scaling=0.05,
+)
+GIVEN = {
+    "seed": 3,
+    "num_envs": 24,
+    "unroll_length": 8,
+    "num_minibatches": 4,
+    "batch_size": 6,  # environments of a minibatch
+    "num_updates_per_batch": 5,
+    "discounting": 0.98,
+    "gae_lambda": 0.9,
+    "learning_rate": 2e-4,
+    "clipping_epsilon": 0.3,
+    "entropy_cost": 1e-3,
+    "vf_loss_coefficient": 0.7,
+    "max_grad_norm": 0.4,
+    "learning_rate_schedule": "ADAPTIVE_KL",
+    "desired_kl": 0.03,
+    "reward_scaling": 0.05,
+    "normalize_observations": True,
+    # 6 iterations of 192 steps; Brax's epochs are their number less one
+    "num_timesteps": 1152,
+    "num_evals": 7,
+}
+
+
+def test_every_hyperparameter_has_its_place_in_braxs_trainer():
+    given = trainer.arguments(toys.Counter(), CONFIG)
+    assert {name: given[name] for name in GIVEN} == GIVEN
+    assert set(given) <= set(inspect.signature(brax_ppo.train).parameters)
+
+
+def test_without_a_target_the_learning_rate_stays():
+    given = trainer.arguments(toys.Counter(), CONFIG.replace(target_kl=0.0))
+    assert given["learning_rate_schedule"] == "NONE"
+
+
+def test_a_training_step_of_brax_is_an_iteration_of_ours():
+    given = trainer.arguments(toys.Counter(), CONFIG)
+    step = given["batch_size"] * given["num_minibatches"] * given["unroll_length"]
+    assert step == CONFIG.ppo.steps_per_iteration
+
+
+def test_networks_are_ours_whatever_brax_proposes():
+    factory = trainer.arguments(toys.Counter(), CONFIG)["network_factory"]
+    networks = factory((3,), 1, preprocess_observations_fn=None)
+    policy = networks.policy_network.init(jax.random.key(0))
+    shapes = {leaf.shape for leaf in jax.tree.leaves(policy)}
+    assert (3, CONFIG.ppo.hidden_sizes[0]) in shapes
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"resume": "runs/x"}, "resume"),
+        ({"num_seeds": 2}, "num_seeds"),
+        ({"num_envs": 6, "num_minibatches": 4}, "num_minibatches"),
+    ],
+)
+def test_what_brax_cannot_do_is_refused_by_name(changes, named):
+    with pytest.raises(ConfigError, match=named):
+        CONFIG.replace(**changes)
+
+
+def test_devices_share_environments_and_minibatches_equally(monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 4)
+    assert trainer.devices(CONFIG) == 3  # 6 environments in a minibatch
+    assert trainer.devices(CONFIG.replace(num_devices=2)) == 2
+    assert trainer.devices(CONFIG.replace(num_envs=20)) == 1

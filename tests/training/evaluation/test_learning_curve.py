@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 
 from rmp_mjx.metric import SUCCESS, Metric, by_name
-from rmp_mjx.training.evaluation import curves, learning_curve
+from rmp_mjx.training.evaluation import curves, learning_curve, style
 from rmp_mjx.training.evaluation.learning_curve import Baseline
 
 METRICS = by_name(
@@ -187,3 +187,13 @@ def test_the_seeds_of_a_run_are_smoothed_apart():
 )
 def test_policy_steps_have_the_unit_of_the_whole_axis(count, last, shown):
     assert learning_curve.style.steps(count, last) == shown
+
+
+@pytest.mark.parametrize("touched", [True, False])
+def test_histograms_are_pictures_with_or_without_contact(tmp_path, touched):
+    peaks = {"one": np.array([0.0, 30.0 * touched]), "two": np.zeros(3)}
+    style.plot_forces(peaks, tmp_path / "f.png", "title")
+    gaps = {"one": np.array([0.1, -0.01])}
+    style.plot_clearances(gaps, tmp_path / "c.png", "title")
+    for name in ("f.png", "c.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

@@ -16,7 +16,7 @@ from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.config import ConfigError, config_of, read_record
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.policies import load_agent
-from rmp_mjx.training.runs.stopping import StopRequest
+from rmp_mjx.training.runs.saving import StopRequest
 from tests.training import toys
 from tests.training.conftest import ITERATIONS, bits, newest_state, run, small
 

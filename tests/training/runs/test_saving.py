@@ -19,7 +19,7 @@ from rmp_mjx.training.runs.checkpoint import Checkpointer, SaveError
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.metrics import Row
 from rmp_mjx.training.runs.saving import Saver
-from rmp_mjx.training.runs.stopping import TrainingFailure
+from rmp_mjx.training.runs.saving import TrainingFailure
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 STATE = {"x": jnp.ones(3)}
@@ -133,7 +133,7 @@ from rich.console import Console
 from rmp_mjx import runtime
 from rmp_mjx.training.runs.saving import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer
-from rmp_mjx.training.runs.stopping import TrainingFailure
+from rmp_mjx.training.runs.saving import TrainingFailure
 from tests.training.conftest import run
 
 runtime.configure()

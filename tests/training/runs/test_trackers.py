@@ -7,7 +7,6 @@ import sys
 
 import pytest
 from rich.console import Console
-from tensorboardX.proto import event_pb2
 
 from rmp_mjx.training.runs import run_folder, trackers
 from rmp_mjx.training.config import ConfigError
@@ -87,7 +86,7 @@ def events(folder):
         data = path.read_bytes()
         while data:
             (size,) = struct.unpack("Q", data[:8])
-            found.append(event_pb2.Event.FromString(data[12 : 12 + size]))
+            found.append(trackers.Event.FromString(data[12 : 12 + size]))
             data = data[16 + size :]
     return found
 
@@ -119,7 +118,7 @@ def test_a_resumed_run_keeps_tensorboards_values_up_to_where_it_goes_on(tmp_path
         tensorboard.close(0)
     starts = [e.step for e in events(tmp_path) if e.HasField("session_log")]
     assert starts == [641]
-    assert event_pb2.SessionLog.START == 1
+    assert trackers.SessionLog.START == 1
 
 
 @pytest.mark.parametrize("name", trackers.OPTIONAL)
