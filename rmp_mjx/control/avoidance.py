@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,9 @@ from rmp_mjx.vec import Vec
 from rmp_mjx.xla import materialize
 
 
-def per_link(robot: Robot, values: Float[ArrayLike, " n"]) -> Float[Array, " p"]:
+def per_link(
+    robot: Robot, values: Float[ArrayLike, " n"] | Sequence[float]
+) -> Float[Array, " p"]:
     """A leaf parameter for every control point from one for every link, (n,)."""
     return jnp.asarray(values)[np.array(robot.points.segment, int)]
 

@@ -1,5 +1,7 @@
 """One compiled controller in float64 and one in float32, shared by all tests here."""
 
+import copy
+
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,13 @@ BATCH = 500
 
 QUICK = {"xla_backend_optimization_level": 0}
 """Compiles four times faster, for programs that a test runs only a few times."""
+
+
+def changed(tree, **fields):
+    """A tree with other fields of any type: batches, or what a caller gets wrong."""
+    tree = copy.copy(tree)
+    vars(tree).update(fields)
+    return tree
 
 
 def _controlled(ctrl, q, qd, action, obstacles):

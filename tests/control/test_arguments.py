@@ -1,6 +1,5 @@
 """Arguments of a wrong shape or dtype: the message names them."""
 
-import copy
 import inspect
 import re
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from rmp_mjx import RMPVICES, VICES, Action, ActionRange, Obstacles, Robot
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.controller import ImpedanceController
+from tests.control.conftest import changed
 from tests.robot.test_model import GRIPPER
 
 Q = np.zeros(3, np.float32)
@@ -31,13 +31,6 @@ def own_checks_only(monkeypatch):
     for cls in (ActionRange, ImpedanceController, RMPVICES, VICES, FilteredVICES):
         for name in {"decode", "setpoint", "__call__"} & vars(cls).keys():
             monkeypatch.setattr(cls, name, inspect.unwrap(vars(cls)[name]))
-
-
-def changed(tree, **fields):
-    """The tree with other fields, whatever their types."""
-    tree = copy.copy(tree)
-    vars(tree).update(fields)
-    return tree
 
 
 def call(ctrl, q: Any = Q, qd: Any = Q, obstacles: Any = SLOTS, **fields):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rmp_mjx import RMPVICES, Obstacles, OrientationRelaxation, Robot, SetpointDither
-from tests.control.conftest import QUICK
+from tests.control.conftest import QUICK, changed
 from tests.robot.test_model import GRIPPER
 
 STILL = jnp.zeros(3)
@@ -92,7 +92,7 @@ def test_weight_falls_from_one_to_its_least_as_the_clearance_shrinks():
     weight = OrientationRelaxation(min_weight=0.01, near=0.02, far=0.08)
     clearance = jnp.asarray([jnp.inf, 1.0, 0.08, 0.05, 0.02, -0.1])
     np.testing.assert_allclose(
-        weight(clearance), [1.0, 1.0, 1.0, 0.1, 0.01, 0.01], rtol=1e-6
+        jax.vmap(weight)(clearance), [1.0, 1.0, 1.0, 0.1, 0.01, 0.01], rtol=1e-6
     )
 
 
@@ -102,13 +102,13 @@ def test_orientation_is_relaxed_beside_bodies_but_not_beside_planes(
     """Clearance to spheres, capsules and boxes counts, whatever the floor does."""
     q, qd, action = states(3)
     near = obstacles(3)
-    low = near.planes.replace(point=near.planes.point - 5.0 * UP)
-    high = near.planes.replace(point=near.planes.point + 0.4 * UP)
+    low = changed(near.planes, point=near.planes.point - 5.0 * UP)
+    high = changed(near.planes, point=near.planes.point + 0.4 * UP)
     weights = []
     leaf = OrientationRelaxation(min_weight=0.01, near=0.02, far=0.08)
     holding = ctrl.replace(obstacle_relaxation=leaf, limit_relaxation=None)
     for planes in (low, high):
-        out = run64(holding, q, qd, action, near.replace(planes=planes))
+        out = run64(holding, q, qd, action, changed(near, planes=planes))
         weights.append(out.diagnostics["orientation_weight"])
         clearance = out.diagnostics["clearance"]
         if planes is low:  # then the nearest obstacle is a body

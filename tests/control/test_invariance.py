@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rmp_mjx import Robot
+from tests.control.conftest import changed
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +46,10 @@ def _move_obstacles(o, p, R):
                 new[name] = x @ R.T
             elif name == "rotation":
                 new[name] = R @ x
-        return kind.replace(**new)
+        return changed(kind, **new)
 
     kinds = ("spheres", "planes", "capsules", "boxes")
-    return o.replace(**{k: move(getattr(o, k)) for k in kinds})
+    return changed(o, **{k: move(getattr(o, k)) for k in kinds})
 
 
 def test_mounting_the_arm_elsewhere_changes_no_torque(
@@ -76,8 +77,8 @@ def test_unused_slots_contribute_exactly_nothing(run64, ctrl, inputs):
     before = run64(ctrl, *inputs)
     center = near.spheres.center.copy()
     center[:, 2] = [0.2, 0.0, 0.3]  # the third sphere's slot is not in use
-    spheres = near.spheres.replace(center=center)
-    after = run64(ctrl, q, qd, action, near.replace(spheres=spheres))
+    spheres = changed(near.spheres, center=center)
+    after = run64(ctrl, q, qd, action, changed(near, spheres=spheres))
     np.testing.assert_array_equal(after.tau, before.tau)
     np.testing.assert_array_equal(after.M, before.M)
 
@@ -85,13 +86,14 @@ def test_unused_slots_contribute_exactly_nothing(run64, ctrl, inputs):
 def test_switched_off_obstacles_are_no_obstacles(run64, ctrl, inputs):
     """All slots off equals a collision leaf without weight; clearance is infinite."""
     q, qd, action, near = inputs
-    off = near.replace(
+    off = changed(
+        near,
         **{
-            kind: getattr(near, kind).replace(
-                active=np.zeros_like(getattr(near, kind).active)
+            kind: changed(
+                getattr(near, kind), active=np.zeros_like(getattr(near, kind).active)
             )
             for kind in ("spheres", "planes", "capsules", "boxes")
-        }
+        },
     )
     out = run64(ctrl, q, qd, action, off)
     weightless = ctrl.with_collision(ctrl.leaves.collision.replace(mu=0.0)).replace(
@@ -115,13 +117,14 @@ def test_clearance_is_the_distance_to_the_nearest_control_point(
 ):
     """Recomputed with MuJoCo's kinematics for the spheres of the first ten states."""
     q, qd, action, near = inputs
-    only = near.replace(
+    only = changed(
+        near,
         **{
-            kind: getattr(near, kind).replace(
-                active=np.zeros_like(getattr(near, kind).active)
+            kind: changed(
+                getattr(near, kind), active=np.zeros_like(getattr(near, kind).active)
             )
             for kind in ("planes", "capsules", "boxes")
-        }
+        },
     )
     clearance = run64(ctrl, q, qd, action, only).diagnostics["clearance"]
     model = robot.mj_model

@@ -134,4 +134,4 @@ def _pose(robot, q):
 def _points(robot, q):
     """World positions of the control points, in the arithmetic of the controller."""
     x = point_state(robot, arm_state(robot, q, jnp.zeros_like(q))).x
-    return x.stack(-1) + base_point(robot)
+    return x.stack(-1) + base_point(robot)[None]

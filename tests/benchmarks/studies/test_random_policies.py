@@ -96,3 +96,11 @@ def test_the_table_of_the_ablation_is_that_of_the_committed_rows():
     assert table.count("\n") == len(random_policies.CONTROLLERS) + 1
     page = (ROOT / "docs/ablation.md").read_text()
     assert insert(page, {"ablation": table}) == page
+
+
+def test_the_printed_leaf_acts_on_a_body_that_leaves_and_accelerates_it():
+    """1e-5: float32 rounding of the fourth power."""
+    x, xd = jnp.full(2, 0.1), jnp.asarray([-0.5, 0.5])
+    f, m = random_policies.PrintedCollision(eta=2.0).scalar(x, xd)
+    np.testing.assert_allclose(m, [0.0, 2500.0], rtol=1e-5)
+    np.testing.assert_allclose(f, [0.0, 2500.0], rtol=1e-5)
