@@ -17,11 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import rmp_mjx as rmp
 from rmp_mjx import runtime
+from rmp_mjx.control.torque import scale_torque
+from rmp_mjx.control.tree import rmp_vices_tree
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.training.learning import devices
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -305,3 +311,32 @@ def insert(text: str, tables: Mapping[str, str]) -> str:
         if not found:
             raise ValueError(f"the page has no '<!-- {name} -->' ... '<!-- end -->'")
     return text
+
+
+class AutodiffRMPVICES(rmp.RMPVICES):
+    """The definition of the controller, at time 0 of the set-point: without dither."""
+
+    def __call__(self, q, qd, setpoint, obstacles):
+        """Torque for one state.
+
+        The weight of the orientation is the closed form's. Compiled, nothing else of
+        that is left.
+        """
+        out = super().__call__(q, qd, setpoint, obstacles)
+        q, qd = jnp.asarray(q), jnp.asarray(qd)
+        Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
+        tree = rmp_vices_tree(
+            self.robot,
+            self.leaves,
+            setpoint,
+            obstacles,
+            Mq,
+            self.attractor_weight,
+            out.diagnostics["orientation_weight"],
+        )
+        root = rmp.evaluate(tree, q, qd)
+        qdd = rmp.resolve(root, self.regularizer * Mq)
+        dynamic = jnp.matmul(Mq, qdd, precision="highest")
+        tau, scale = scale_torque(dynamic, bias, jnp.asarray(self.robot.tau_max))
+        diagnostics = out.diagnostics | {"torque_scale": scale}
+        return rmp.ControlOutput(tau, qdd, root.f, root.M, diagnostics)

@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from envs import measures
-from envs.measures import Measures
+from envs import types as measures
 from envs.options import CTRL_DT
 from envs.placement import place_spheres
 from envs.safety import SafetyRecord
 from envs.spheres import AWAY, Spheres
 from envs.task import OptionsT
-from envs.types import State
+from envs.types import Measures, State
 from envs.world import World
 from rmp_mjx.control import ACTION_SIZE
 from rmp_mjx.metric import Metric, by_name

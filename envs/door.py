@@ -14,8 +14,8 @@ from envs import options
 from envs.base import ArmEnv
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, Contacts
+from envs.task import View
 from envs.types import Entry, Score
-from envs.views import View
 from rmp_mjx.control import Controller, per_link
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.metric import Metric

@@ -16,8 +16,8 @@ from envs.base import ArmEnv
 from envs.placement import CANDIDATES
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
+from envs.task import GOAL, Mark
 from envs.types import Entry, Score, State
-from envs.views import GOAL, Mark
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles

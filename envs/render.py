@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from envs.base import ArmEnv
+from envs.task import Mark
 from envs.types import State
-from envs.views import Mark
 
 SIZE = (480, 640)
 """Height and width of a frame [pixels]."""

@@ -1,5 +1,6 @@
 """What a finished run leaves: curves, evaluation, pictures, policies."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -7,8 +8,8 @@ import jax
 import polars as pl
 from rich.console import Console
 
-from envs import baselines
 from envs.base import ArmEnv
+from envs.options import Options
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluation import curves, evaluate, film, report
 from rmp_mjx.training.evaluation.learning_curve import (
@@ -64,7 +65,7 @@ def plot(env: ArmEnv, config: TrainConfig, folder: Path) -> None:
         (folder / run_folder.SEEDS).mkdir(exist_ok=True)
         together = metrics.over_seeds(rows, curves.columns(rows))
         together.write_parquet(folder / run_folder.SEED_CURVES)
-    found = baselines.rows(config.task)
+    found = baseline_rows(config.task)
     baseline = None
     if found is not None:
         label = f"VICES, {found['seed'].n_unique()} seeds, default task"
@@ -104,3 +105,34 @@ def evaluate_seeds(
         from envs.render import render  # loads graphics libraries
 
         film.publish(partial(render, env), tapes[0], env.dt, folder, console)
+
+
+RESULTS = Path(__file__).parents[1] / "docs/results/store/training.parquet"
+"""Training rows of all the paper's runs, in a checkout of the repository."""
+VARIANT = "vices"
+"""The baseline among them."""
+FREE = ("controller", "physics")
+"""Options in which a run may differ from the baseline and still be compared."""
+
+
+def baseline_rows(options: Options, results: Path = RESULTS) -> pl.DataFrame | None:
+    """Training rows of VICES on a task, with the column `seed`.
+
+    Args:
+        options: Options of the task. The baseline ran with the defaults.
+        results: File with the rows.
+
+    Returns:
+        The rows; None if the options are not the defaults, or nothing is known.
+    """
+    changes = {name: getattr(options, name) for name in FREE}
+    if options != dataclasses.replace(type(options)(), **changes):
+        return None
+    if not results.exists():
+        return None
+    of_task = (pl.col("task") == options.env) & (pl.col("variant") == VARIANT)
+    found = pl.scan_parquet(results).filter(of_task).collect()
+    if found.is_empty():
+        return None
+    # All runs of the results have iterations of one size.
+    return found.with_columns(iteration=pl.col("steps"))

@@ -13,8 +13,8 @@ from envs import options
 from envs.base import ArmEnv
 from envs.placement import sample_apart
 from envs.safety import SafetyRecord
+from envs.task import CURRENT, LATER, REACHED, Mark
 from envs.types import Entry, Score, State
-from envs.views import CURRENT, LATER, REACHED, Mark
 from rmp_mjx.metric import Metric
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs.options import CONTROLLERS, substeps
-from envs.safety import SafetyRecord, observe
+from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, build_scene
-from envs.smoothness import Motion, Torques
 from envs.spheres import Spheres
 from envs.task import OptionsT, Task
 from rmp_mjx import sim

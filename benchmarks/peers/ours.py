@@ -17,9 +17,8 @@ from mujoco import mjx
 
 import envs
 import rmp_mjx as rmp
-from benchmarks.autodiff import AutodiffRMPVICES
-from benchmarks.common import on_all_devices
-from benchmarks.peers.point_mass import ACTION_SIZE, OBSERVATION_SIZE, SETTINGS, Point
+from benchmarks.common import AutodiffRMPVICES, on_all_devices
+from benchmarks.peers.brax_trainer import ACTION_SIZE, OBSERVATION_SIZE, SETTINGS, Point
 from benchmarks.peers.problem import controller
 from benchmarks.peers.worker import Measure, latency, rate, serve
 from benchmarks.speed.bench_controller import BATCH, random_states

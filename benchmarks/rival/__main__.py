@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> None:
     size = str(args.num_envs)
     try:
         theirs = Contestant(
-            "benchmarks.rival.theirs",
+            "benchmarks.rival.ppo",
             [str(folder / problem.SCENE), str(folder / problem.ARRAYS), size],
             venv.python("rival", REQUIREMENTS),
         )

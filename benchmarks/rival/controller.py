@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange  # pyright: ignore[reportMissingImports]
 
-from benchmarks.rival.kernels import (
+from benchmarks.rival.task import (
     FAST,
     N,
     add_row,

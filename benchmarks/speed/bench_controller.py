@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import rmp_mjx as rmp
-from benchmarks.autodiff import AutodiffRMPVICES
 from benchmarks.common import (
+    AutodiffRMPVICES,
     Row,
     measure,
     measure_calls,

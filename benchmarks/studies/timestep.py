@@ -20,8 +20,7 @@ import numpy as np
 import envs
 from benchmarks.common import Row, show, write_json
 from benchmarks.png import save_figure
-from envs.safety import observe
-from envs.smoothness import Motion, Torques
+from envs.safety import Motion, Torques, observe
 from rmp_mjx import runtime
 from rmp_mjx.robot.kinematics import site_pose
 from rmp_mjx.sim import PhysicsState, load_physics, read_contacts

@@ -34,8 +34,7 @@ from rmp_mjx.robot.mjcf import (
     read_spec,
     remove_gravity_compensation,
 )
-from rmp_mjx.robot.motors import make_motors
-from rmp_mjx.robot.passive import PassiveForces, passive_forces
+from rmp_mjx.robot.motors import PassiveForces, make_motors, passive_forces
 from rmp_mjx.robot.posture import nominal_posture
 from rmp_mjx.types import Constant
 

@@ -157,10 +157,6 @@ def test_a_grid_of_version_0_1_is_read(tmp_path):
     assert cells["push-osc"].task.obstacles == 1
 
 
-OLD = Path(__file__).with_name("config-0.1.json")
-"""A configuration as version 0.1 wrote it."""
-
-
 @pytest.mark.parametrize("env", envs.names())
 def test_no_flag_is_the_default_configuration(env):
     assert parsed("--env", env) == make_config(env)

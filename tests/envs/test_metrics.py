@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 import envs
-from envs import measures, safety
+from envs import safety
+from envs import types as measures
 from envs.door import Door, DoorOptions
 from envs.safety import SafetyRecord
 from envs.trajectory import Trajectory, TrajectoryOptions

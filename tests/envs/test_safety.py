@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.smoothness import Motion, Torques
+from envs.safety import Motion, Torques
 from tests.envs.arm_tasks import LANES
 
 DOWN, SPHERE, SIDE, LIMIT, TURN = 0, 1, 2, 3, 4  # lanes; the others rest

@@ -34,7 +34,7 @@ from benchmarks.paper.cells import COLUMNS, PAPER, PRESETS, TASKS, Cell
 from benchmarks.paper.store import Store
 from envs.cli import make_config
 from envs.flags import load_config
-from envs.measures import METRICS
+from envs.types import METRICS
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import run_folder, saving

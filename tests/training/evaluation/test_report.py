@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from envs import measures
+from envs import types as measures
 from envs.door import Door
 from rmp_mjx.metric import SUCCESS, Metric, by_name
 from rmp_mjx.training.evaluation import report

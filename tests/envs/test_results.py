@@ -4,7 +4,7 @@ import polars as pl
 import pytest
 
 import envs
-from envs import baselines
+from envs import results as outcome
 
 
 @pytest.fixture
@@ -23,14 +23,16 @@ def results(tmp_path):
 
 def test_vices_rows_of_the_task_are_found(results):
     options = envs.make_options("push", controller="rmp_vices", physics="mjx")
-    found = baselines.rows(options, results)
+    found = outcome.baseline_rows(options, results)
     assert found is not None
     assert found["seed"].to_list() == [0, 1]
     assert set(found["task"]) == {"push"} and set(found["variant"]) == {"vices"}
 
 
 def test_another_task_and_other_options_have_no_baseline(results, tmp_path):
-    assert baselines.rows(envs.make_options("trajectory"), results) is None
-    assert baselines.rows(envs.make_options("push", obstacles=2), results) is None
+    assert outcome.baseline_rows(envs.make_options("trajectory"), results) is None
+    assert (
+        outcome.baseline_rows(envs.make_options("push", obstacles=2), results) is None
+    )
     default = envs.make_options("push")
-    assert baselines.rows(default, tmp_path / "missing.parquet") is None
+    assert outcome.baseline_rows(default, tmp_path / "missing.parquet") is None

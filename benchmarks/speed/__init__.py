@@ -1,1 +1,0 @@
-"""Speed: of the controller, the environments, training, and its regression gate."""

@@ -1,1 +1,0 @@
-"""Studies of safety, success, accuracy and parameters."""
