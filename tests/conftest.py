@@ -76,3 +76,12 @@ def ranks(request):
     strict = request.path.parent.name in CONTROLLER
     with jax.numpy_rank_promotion("raise" if strict else "allow"):
         yield
+
+
+@pytest.fixture
+def x64():
+    """Run the test in float64 (not globally: other tests stay in float32)."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield

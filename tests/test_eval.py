@@ -10,7 +10,7 @@ import pytest
 
 import envs
 from rmp_mjx.training.runs import policies
-from tests import toy_task
+from tests.envs import arm_tasks as toy_task
 from tests.training.conftest import run
 
 WANTED = (

@@ -36,7 +36,6 @@ def test_the_tracked_tree_is_small(tracked):
     assert sum(sizes.values()) <= MOST_BYTES, f"the largest: {names}"
 
 
-@pytest.mark.xfail(strict=True, reason="small modules are still to be merged")
 def test_the_tracked_files_are_few(tracked):
     assert len(tracked) <= MOST_FILES
 

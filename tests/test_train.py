@@ -12,7 +12,7 @@ import train
 from envs import grid
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.policy import load_policy
-from tests import toy_task
+from tests.envs import arm_tasks as toy_task
 from tests.training.conftest import SMALL
 
 OPTIONS = [

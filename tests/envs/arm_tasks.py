@@ -1,12 +1,18 @@
 """What the tests of the tasks share: a toy controller, and MuJoCo C as the judge."""
 
+import dataclasses
+from typing import ClassVar, Literal
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+import envs
+from envs.options import Options
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.types import ControlOutput, Setpoint
+from tests.training import toys
 
 LANES = 8
 
@@ -79,3 +85,34 @@ class Arm:
                 force[pair] = force.get(pair, 0.0) + wrench[0]
             rows.append((d.qpos.copy(), force))
         return rows
+
+
+@dataclasses.dataclass(frozen=True)
+class CounterOptions(Options):
+    """Options of counting."""
+
+    env: ClassVar[str] = "counter"
+    variant: Literal["light", "heavy"] = "light"
+    """Which counter."""
+
+
+class Counter:
+    """Makes the toy in place of an arm; the engine's name is what was asked for."""
+
+    Options = CounterOptions
+
+    def __new__(cls, options, robot=None, controller=None):
+        return toys.Counter(engine=options.physics)
+
+
+def register(monkeypatch):
+    """Make the toy known; returns the options that tasks are made with from then on."""
+    made, make = [], envs.make
+
+    def noted(options, *rest):
+        made.append(options)
+        return make(options, *rest)
+
+    monkeypatch.setitem(envs.ENVS, "counter", Counter)
+    monkeypatch.setattr(envs, "make", noted)
+    return made

@@ -15,7 +15,7 @@ from rmp_mjx.training.learning import faults
 from rmp_mjx.training.policy import load_policy
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.policies import load_agent
-from tests import toy_task
+from tests.envs import arm_tasks as toy_task
 from tests.training import toys
 from tests.training.conftest import run
 

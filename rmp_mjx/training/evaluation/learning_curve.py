@@ -10,11 +10,11 @@ from pathlib import Path
 import polars as pl
 
 from rmp_mjx.metric import LENGTH, RETURN, Metric
-from rmp_mjx.training.evaluation import curves, style
+from rmp_mjx.training.evaluation import curves, plots
 from rmp_mjx.training.evaluation.curves import Stroke
 from rmp_mjx.training.runs.metrics import SEED
 
-RUN = Stroke(style.RUN, "this run")
+RUN = Stroke(plots.RUN, "this run")
 """How a run's own curve is drawn."""
 PANELS = 6
 """Panels of the learning curve at most."""
@@ -61,21 +61,21 @@ def plot_learning_curve(
     wide = 2 if len(drawn) == 4 else min(3, len(drawn))
     high = -(-len(drawn) // wide)
     size = 10.0, 1.1 + 2.3 * high
-    with style.page(picture, high, wide, size) as (figure, axes):
+    with plots.page(picture, high, wide, size) as (figure, axes):
         for column, axis in zip(drawn, axes, strict=False):
             scale = curves.factor(column, known)
             if baseline and column in baseline.rows.columns:
                 other = baseline.rows.filter(pl.col("steps") <= last)
-                stroke = Stroke(style.OTHER, baseline.label, thin=False)
+                stroke = Stroke(plots.OTHER, baseline.label, thin=False)
                 curves.draw(axis, other, column, scale, steps, stroke)
             curves.draw(axis, rows, column, scale, steps, RUN)
-            style.finish(axis, curves.title(column, known), last)
-        style.tidy(axes, len(drawn), wide)
-        style.heading(figure, title)
+            plots.finish(axis, curves.title(column, known), last)
+        plots.tidy(axes, len(drawn), wide)
+        plots.heading(figure, title)
         lines = _explained(rows, baseline)
         if zero := zero_throughout(rows, metrics):
             lines += textwrap.wrap(f"Zero throughout: {', '.join(zero)}.", LINE)
-        style.caption(figure, "\n".join(lines))
+        plots.caption(figure, "\n".join(lines))
         if baseline:
             handles, labels = axes[0].get_legend_handles_labels()
             figure.legend(
@@ -104,18 +104,18 @@ def plot_details(
     steps, last = curves.window(rows), curves.last_step(rows)
     high = max(1, -(-len(drawn) // COLUMNS))
     size = 10.0, 1.2 + 1.6 * high
-    with style.page(picture, high, COLUMNS, size) as (figure, axes):
+    with plots.page(picture, high, COLUMNS, size) as (figure, axes):
         for column, axis in zip(drawn, axes, strict=False):
             scale = curves.factor(column, known)
             curves.draw(axis, rows, column, scale, steps, RUN)
-            style.finish(axis, curves.title(column, known, short=True), last)
-        style.tidy(axes, len(drawn), COLUMNS)
-        style.heading(figure, f"{title}: details of training")
+            plots.finish(axis, curves.title(column, known, short=True), last)
+        plots.tidy(axes, len(drawn), COLUMNS)
+        plots.heading(figure, f"{title}: details of training")
         lines = _explained(rows)
         if zero:
             names = ", ".join(curves.label(n, known) for n in zero)
             lines += textwrap.wrap(f"Zero throughout: {names}.", LINE)
-        style.caption(figure, "\n".join(lines))
+        plots.caption(figure, "\n".join(lines))
 
 
 def panels(
@@ -146,7 +146,7 @@ def zero_throughout(rows: pl.DataFrame, metrics: Mapping[str, Metric]) -> list[s
 
 def _explained(rows: pl.DataFrame, baseline: Baseline | None = None) -> list[str]:
     """How to read the curves."""
-    window = style.steps(curves.window(rows), digits=2)
+    window = plots.steps(curves.window(rows), digits=2)
     mean = f"running mean over {window} policy steps"
     count = rows[SEED].n_unique() if SEED in rows.columns else 1
     band = "95 % bootstrap interval"

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from rmp_mjx.files import write_text
 from rmp_mjx.metric import LENGTH, RETURN, Metric, Statistic, number
-from rmp_mjx.training.evaluation import style
+from rmp_mjx.training.evaluation import plots
 from rmp_mjx.training.evaluation.evaluate import Episodes, over_seeds, summarise
 from rmp_mjx.training.runs import run_folder
 
@@ -121,8 +121,8 @@ def save(
     ]
     pl.concat(rows).write_parquet(folder / run_folder.EPISODES)
     for metric, plot, name in (
-        ("contact_force_peak", style.plot_forces, run_folder.FORCES),
-        ("clearance", style.plot_clearances, run_folder.CLEARANCES),
+        ("contact_force_peak", plots.plot_forces, run_folder.FORCES),
+        ("clearance", plots.plot_clearances, run_folder.CLEARANCES),
     ):
         found = {k: values[metric] for k, values in results.items() if metric in values}
         if found:

@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 
 from rmp_mjx.metric import SUCCESS, Metric, by_name
-from rmp_mjx.training.evaluation import curves, learning_curve, style
+from rmp_mjx.training.evaluation import curves, learning_curve, plots
 from rmp_mjx.training.evaluation.learning_curve import Baseline
 
 METRICS = by_name(
@@ -49,7 +49,7 @@ def seeds(*frames):
 @pytest.fixture
 def drawn(monkeypatch, tmp_path):
     """`drawn(plot, ...)`: the figure that a plot writes, once it is finished."""
-    pages, page = [], learning_curve.style.page
+    pages, page = [], learning_curve.plots.page
 
     def kept(*args):
         manager = page(*args)
@@ -72,7 +72,7 @@ def drawn(monkeypatch, tmp_path):
         figure, axes = pages[-1]
         return figure, {axis.get_title("left"): axis for axis in axes if axis.axison}
 
-    monkeypatch.setattr(learning_curve.style, "page", kept)
+    monkeypatch.setattr(learning_curve.plots, "page", kept)
     return draw
 
 
@@ -93,7 +93,7 @@ def test_the_first_page_has_the_headlines_between_return_and_length(drawn):
         ]
         or list(axes)[-1] == "Episode length [steps]"
     )
-    width, _ = figure.get_size_inches() * learning_curve.style.DPI
+    width, _ = figure.get_size_inches() * learning_curve.plots.DPI
     assert width == 1200
     assert axes["Gap [mm]"].lines[0].get_ydata()[-1] == pytest.approx(200.0)
 
@@ -186,14 +186,14 @@ def test_the_seeds_of_a_run_are_smoothed_apart():
     ],
 )
 def test_policy_steps_have_the_unit_of_the_whole_axis(count, last, shown):
-    assert learning_curve.style.steps(count, last) == shown
+    assert learning_curve.plots.steps(count, last) == shown
 
 
 @pytest.mark.parametrize("touched", [True, False])
 def test_histograms_are_pictures_with_or_without_contact(tmp_path, touched):
     peaks = {"one": np.array([0.0, 30.0 * touched]), "two": np.zeros(3)}
-    style.plot_forces(peaks, tmp_path / "f.png", "title")
+    plots.plot_forces(peaks, tmp_path / "f.png", "title")
     gaps = {"one": np.array([0.1, -0.01])}
-    style.plot_clearances(gaps, tmp_path / "c.png", "title")
+    plots.plot_clearances(gaps, tmp_path / "c.png", "title")
     for name in ("f.png", "c.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

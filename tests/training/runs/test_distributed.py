@@ -23,7 +23,7 @@ def start(root, devices, **asked):
     """A process with so many CPU devices that trains the counting toy."""
     flags = f"--xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.training.runs.member", json.dumps(asked)],
+        [sys.executable, "-m", "tests.training.runs.processes", "member", json.dumps(asked)],
         cwd=root,
         env={**os.environ, "XLA_FLAGS": flags},
         stdout=subprocess.PIPE,

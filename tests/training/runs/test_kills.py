@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 
 from rmp_mjx.training.runs import run_folder
-from tests.training.runs import victim
+from tests.training.runs import processes
 from tests.training.conftest import bits, newest_state, run
 
 PATIENCE = 120.0
@@ -25,7 +25,7 @@ LONGEST_SAVE = 0.15
 def reference(tmp_path_factory):
     """An uninterrupted run: its configuration, last state and rows."""
     folder = tmp_path_factory.mktemp("kills") / "reference"
-    _, config = run(folder, **victim.OPTIONS)
+    _, config = run(folder, **processes.OPTIONS)
     return config, last_state(folder, config), rows(folder)
 
 
@@ -45,7 +45,7 @@ class Victim:
     def __init__(self, root, folder, *resume):
         self.heard: list[tuple[str, int]] = []
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.training.runs.victim", str(folder), *resume],
+            [sys.executable, "-m", "tests.training.runs.processes", "victim", str(folder), *resume],
             cwd=root,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -136,4 +136,4 @@ def test_a_terminated_process_saves_says_how_to_resume_and_exits_with_143(
     code, error = process.end()
     assert code == 128 + signal.SIGTERM
     assert "stopping after this iteration" in error
-    assert process.last("saved") == process.last("iteration") < victim.ITERATIONS
+    assert process.last("saved") == process.last("iteration") < processes.ITERATIONS

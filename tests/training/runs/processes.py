@@ -1,17 +1,23 @@
-"""A training process to be killed: `python -m tests.training.runs.victim FOLDER [resume]`.
+"""Processes that tests start: `python -m tests.training.runs.processes ROLE ...`.
 
-It says on standard output what it is doing, line by line.
+`victim FOLDER [resume]` says on standard output what it is doing, line by line, until
+somebody kills it. `member JSON` trains the counting toy together with others.
 """
 
+import json
 import sys
-from typing import Any
 from pathlib import Path
+from typing import Any
+
+from rich.console import Console
 
 from rmp_mjx import runtime
 from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.logging import RunLogger
-from tests.training.conftest import SMALL, run
+from rmp_mjx.training.runs import distributed
+from tests.training import toys
+from tests.training.conftest import SMALL, run, small
 
 ITERATIONS = 60
 OPTIONS = {
@@ -49,13 +55,36 @@ def speak() -> None:
     train_module._start = spoken_start
 
 
-def main() -> int:
+def victim(folder: str, *resume: str) -> int:
+    """Train, and say aloud what is done, until somebody kills the process."""
     runtime.configure()
     speak()
-    folder, *resume = sys.argv[1:]
     place = {"run_dir": None, "resume": folder} if resume else {}
     result, _ = run(Path(folder), **{**OPTIONS, **place})
     return result.exit_code
+
+
+def member(options: str) -> int:
+    """Train as one of several processes.
+
+    Args:
+        options: JSON object of what differs from `conftest.SMALL`, and under `process`
+            coordinator, number of this process and number of all (or nulls).
+    """
+    changes = json.loads(options)
+    distributed.join(*changes.pop("process"))
+    runtime.configure()
+    config = small(**changes)
+    folder, lock = distributed.open_run(config)
+    with lock:
+        return train_module.train(
+            toys.Counter(), config, folder, Console(quiet=True)
+        ).exit_code
+
+
+def main() -> int:
+    role, *arguments = sys.argv[1:]
+    return {"victim": victim, "member": member}[role](*arguments)
 
 
 if __name__ == "__main__":
