@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import statistics
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -27,7 +26,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import polars as pl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -121,21 +119,11 @@ Curve = list[tuple[int, float]]
 """Policy steps and mean return of an episode."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """One training."""
-
-    curve: Curve
-    """Its evaluations."""
-    steps_per_s: float
-    """Policy steps a second: the median over the iterations after the first two."""
-
-
 def load(name: str) -> tuple[Any, Any]:
     """A task, and what its configuration says of it.
 
-    Trajectory following is run with VICES and episodes of 256 steps: a fifth of the
-    time of the usual ones.
+    Trajectory following is run with VICES and episodes of 256 steps, a quarter of the
+    usual length, to save time.
     """
     if name == "reach":
         return Reach(), ReachOptions()
@@ -145,7 +133,7 @@ def load(name: str) -> tuple[Any, Any]:
 
 def train(
     which: Which, task: Any, options: Any, judge: Judge, points: int, **given: Any
-) -> Run:
+) -> Curve:
     """Train with one of the loops and judge the policies that it saves on the way."""
     with tempfile.TemporaryDirectory() as folder:
         config = TrainConfig(options, PPOConfig(), RunConfig(), trainer=which)
@@ -161,8 +149,7 @@ def train(
                 task, config, Path(folder), True, print, checkpoint=str(done)
             )
             curve.append((done * config.ppo.steps_per_iteration, judge(agent)))
-        rows = pl.read_parquet(Path(folder) / run_folder.METRICS)
-    return Run(curve, statistics.median(rows["time/steps_per_s"].to_list()[2:]))
+    return curve
 
 
 def trials(which: Which, task: str) -> list[dict[str, float]]:
@@ -189,12 +176,12 @@ def compare(name: str, steps: int, seeds: int, points: int) -> dict[str, Any]:
         tried = []
         for setting in trials(which, name):
             given = {"num_timesteps": steps, "seed": TUNING_SEED, **setting}
-            run = train(which, task, options, judge, 1, **given)
-            tried.append({**setting, "return": run.curve[-1][1]})
+            curve = train(which, task, options, judge, 1, **given)
+            tried.append({**setting, "return": curve[-1][1]})
             print(f"{name}, {which}, tried: {tried[-1]}", flush=True)
         best = max(tried, key=lambda trial: trial["return"])
         chosen = {key: value for key, value in best.items() if key != "return"}
-        runs = [
+        curves = [
             train(
                 which,
                 task,
@@ -207,24 +194,23 @@ def compare(name: str, steps: int, seeds: int, points: int) -> dict[str, Any]:
             )
             for seed in range(seeds)
         ]
-        found[which] = {"trials": tried, "chosen": chosen, **summary(runs)}
+        found[which] = {"trials": tried, "chosen": chosen, **summary(curves)}
         last, low, high = found[which]["last"]
         print(f"{name}, {which}: last return {last:.4g} [{low:.4g}, {high:.4g}]")
     return found
 
 
-def summary(runs: Sequence[Run]) -> dict[str, Any]:
-    """Over the seeds: the curve with its interval, the last return, the speed."""
-    values = np.array([[value for _, value in run.curve] for run in runs])
+def summary(curves: Sequence[Curve]) -> dict[str, Any]:
+    """Over the seeds: the curve with its interval, and the last return."""
+    values = np.array([[value for _, value in curve] for curve in curves])
     low, high = bootstrap_curve(values)
     last = values[:, -1]
     return {
-        "steps": [step for step, _ in runs[0].curve],
+        "steps": [step for step, _ in curves[0]],
         "return": interquartile_mean(values).tolist(),
         "low": low.tolist(),
         "high": high.tolist(),
         "last": [float(last.mean()), *bootstrap_mean(last)],
-        "steps_per_s": statistics.median(run.steps_per_s for run in runs),
     }
 
 
