@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.autodiff import AutodiffRMPVICES
 
+from benchmarks.common import AutodiffRMPVICES
 from rmp_mjx import RMPVICES, Leaves, Node, Siblings, per_link
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near, collision_transit
