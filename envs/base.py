@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from envs import types as measures
 from envs.options import CTRL_DT
 from envs.placement import place_spheres
 from envs.safety import SafetyRecord
 from envs.spheres import AWAY, Spheres
 from envs.task import OptionsT
-from envs.types import Measures, State
+from envs.types import METRICS, Measures, State
 from envs.world import World
 from rmp_mjx.control import ACTION_SIZE
 from rmp_mjx.metric import Metric, by_name
@@ -46,7 +45,7 @@ class ArmEnv(World[OptionsT]):
     @property
     def metrics(self) -> dict[str, Metric]:
         """What `State.metrics` holds, by name."""
-        return by_name([*measures.METRICS.values(), *self.task_metrics])
+        return by_name([*METRICS.values(), *self.task_metrics])
 
     def reset(self, rng: Array) -> State:
         """Start near the start configuration, everything random drawn anew."""

@@ -1,4 +1,4 @@
-"""The safety record: contacts, forces and joint limits of every step."""
+"""The safety record: contacts, forces, joint limits and smoothness of every step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a task hands over: state, score, entries of the observation."""
+"""What a task hands over: state, score, entries of the observation, measures."""
 
 from __future__ import annotations
 

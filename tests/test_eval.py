@@ -10,7 +10,7 @@ import pytest
 
 import envs
 from rmp_mjx.training.runs import policies
-from tests.envs import arm_tasks as toy_task
+from tests.envs import arm_tasks
 from tests.training.conftest import run
 
 WANTED = (
@@ -27,7 +27,7 @@ WANTED = (
 @pytest.fixture
 def asked(monkeypatch):
     """Options that tasks were made with."""
-    return toy_task.register(monkeypatch)
+    return arm_tasks.register(monkeypatch)
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_a_policy_for_another_task_is_refused(evaluate, tmp_path, capsys):
 
 def test_options_of_the_task_override_the_runs(evaluate, asked, tmp_path):
     folder = tmp_path / "run"
-    task = toy_task.CounterOptions(variant="heavy", layout="far", obstacle_noise=0.01)
+    task = arm_tasks.CounterOptions(variant="heavy", layout="far", obstacle_noise=0.01)
     run(folder, task=task)
     options = ["--run", str(folder), "--out", str(tmp_path / "out"), "--no-video"]
     options += ["--episodes", "4", "--obstacles", "2", "--layout", "close"]

@@ -12,7 +12,7 @@ import train
 from envs import grid
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.policy import load_policy
-from tests.envs import arm_tasks as toy_task
+from tests.envs import arm_tasks
 from tests.training.conftest import SMALL
 
 OPTIONS = [
@@ -34,7 +34,7 @@ OPTIONS += [
 @pytest.fixture
 def toy(monkeypatch):
     """Options that the toy was made with."""
-    return toy_task.register(monkeypatch)
+    return arm_tasks.register(monkeypatch)
 
 
 def test_a_run_trains_evaluates_and_plots(toy, tmp_path):
@@ -78,7 +78,7 @@ def test_braxs_trainer_leaves_the_same_results_and_is_not_resumed(
 
 
 def test_an_interrupted_cell_of_braxs_trainer_begins_anew(tmp_path):
-    config = TrainConfig(toy_task.CounterOptions(), trainer="brax")
+    config = TrainConfig(arm_tasks.CounterOptions(), trainer="brax")
     cells = grid.Grid(tmp_path, {"counter": config}, ("vices",))
     cell = tmp_path / "counter-vices"
     cell.mkdir()

@@ -1,4 +1,4 @@
-"""VICES: the baseline operational-space impedance controller."""
+"""VICES, the baseline operational-space controller, and OSC, its fixed impedance."""
 
 from __future__ import annotations
 

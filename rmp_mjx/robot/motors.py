@@ -1,4 +1,4 @@
-"""One torque motor per joint, whatever actuators the file has."""
+"""One torque motor per joint, whatever the file has, and the joints' passive forces."""
 
 from __future__ import annotations
 

@@ -10,8 +10,7 @@ import pytest
 from rich.console import Console
 
 import envs
-from envs import safety
-from envs import types as measures
+from envs import safety, types
 from envs.door import Door, DoorOptions
 from envs.safety import SafetyRecord
 from envs.trajectory import Trajectory, TrajectoryOptions
@@ -61,8 +60,8 @@ def test_every_environment_has_the_shared_metrics_and_its_own():
     for name in envs.names():
         task = envs.ENVS[name]
         own = {metric.name for metric in task.task_metrics}
-        assert own and not own & measures.METRICS.keys()
-    assert set(measures.METRICS) > set(safety.METRICS)
+        assert own and not own & types.METRICS.keys()
+    assert set(types.METRICS) > set(safety.METRICS)
 
 
 def test_a_record_folds_each_field_as_it_declares():

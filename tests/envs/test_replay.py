@@ -15,7 +15,7 @@ from rmp_mjx.training.learning import faults
 from rmp_mjx.training.policy import load_policy
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.policies import load_agent
-from tests.envs import arm_tasks as toy_task
+from tests.envs import arm_tasks
 from tests.training import toys
 from tests.training.conftest import run
 
@@ -117,7 +117,7 @@ def folder(tmp_path_factory):
     """A finished run of two seeds."""
     folder = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
-        toy_task.register(patch)
+        arm_tasks.register(patch)
         run(folder, num_seeds=2, seed=5)
         yield folder
 

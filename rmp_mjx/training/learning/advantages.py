@@ -1,4 +1,4 @@
-"""Generalised advantage estimation with exact bootstrapping at time limits."""
+"""Generalised advantages, exact at time limits, and the batch made of them."""
 
 import jax
 import jax.numpy as jnp

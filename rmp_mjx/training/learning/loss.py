@@ -1,4 +1,4 @@
-"""PPO's losses (Schulman et al., 2017), over weighted transitions."""
+"""PPO's losses (Schulman et al., 2017), and weighted means of transitions."""
 
 from typing import Any
 

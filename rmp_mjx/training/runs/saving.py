@@ -1,4 +1,4 @@
-"""When a run saves, and what happens if it cannot."""
+"""When a run saves and stops, what happens if it cannot, and what it tells to type."""
 
 import os
 import shutil

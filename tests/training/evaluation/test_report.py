@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from envs import types as measures
+from envs import types
 from envs.door import Door
 from rmp_mjx.metric import SUCCESS, Metric, by_name
 from rmp_mjx.training.evaluation import report
@@ -57,7 +57,7 @@ def test_two_engines_stand_side_by_side_with_what_went_wrong_below():
 
 def test_the_table_of_two_engines_fits_80_columns():
     """With every metric of a task, and the longest values that occur."""
-    metrics = measures.METRICS | by_name(Door.task_metrics)
+    metrics = types.METRICS | by_name(Door.task_metrics)
     found = {"return_mean": -12345.6, "return_sd": 1234.5, "length_mean": 123.4}
     for metric in metrics.values():
         for statistic in metric.table:
