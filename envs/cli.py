@@ -169,7 +169,7 @@ def parse_eval(
     )
     if (options.run is None) == (options.agent == "policy"):
         raise ConfigError("give either --run RUN or --agent zero|random")
-    if path and path.is_file() and options.checkpoint != NEWEST:
+    if path and not path.is_dir() and options.checkpoint != NEWEST:
         raise ConfigError(f"{path} is one policy: leave checkpoint out")
     seeds = config.ppo.num_seeds if config else 1
     if not 0 <= options.seed_index < seeds:

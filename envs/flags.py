@@ -16,7 +16,7 @@ import tyro
 import envs
 from envs.options import Options
 from rmp_mjx.training.config import ConfigError, TrainConfig, config_of, read_record
-from rmp_mjx.training.policy import load_policy
+from rmp_mjx.training.policy import is_policy, load_policy
 from rmp_mjx.training.runs.run_folder import CONFIG
 
 DEFAULT = "trajectory"
@@ -168,7 +168,7 @@ def load_config(path: Path) -> TrainConfig[Options]:
     Raises:
         ConfigError: It is neither, or its configuration cannot be read.
     """
-    if path.is_file():
+    if is_policy(path):
         record = load_policy(path).about["config"]
     else:
         path = path / CONFIG

@@ -3,14 +3,14 @@
 While the experiment runs, every finished part is a file of its own: KIND/PART.parquet.
 `pack` merges them into one file a kind, with the columns that the page reads, and
 parts.parquet, which says of each part how it was made. A store may hold both: a part's
-own file comes before what is packed. A cell's policy is policies/CELL.safetensors.
+own file comes before what is packed. A cell's policy is policies/CELL.safetensors, and
+all of them are packed as policies.safetensors.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +22,7 @@ import polars.selectors as cs
 
 from benchmarks.paper.cells import PICTURED, Cell
 from rmp_mjx.files import replacing
+from rmp_mjx.training.policy import SUFFIX, load_policy, names, save_folder
 
 KEY = "rmp_mjx"
 """Key of the provenance in a parquet file's metadata."""
@@ -92,8 +93,8 @@ class Store:
         return self.folder / kind / f"{_name(cell, column)}.parquet"
 
     def policy(self, cell: Cell) -> Path:
-        """Where a cell's trained policy is."""
-        return self.folder / POLICIES / f"{cell.file}.safetensors"
+        """Where a cell's trained policy is; `load_policy` finds packed ones too."""
+        return self.folder / POLICIES / f"{cell.file}{SUFFIX}"
 
     def write(
         self,
@@ -168,13 +169,13 @@ class Store:
         return [found[part] for part in sorted(found)]
 
     def pack(self, folder: Path) -> list[Path]:
-        """Write all parts as a few small files, and the policies beside them.
+        """Write all parts, and all policies, as a few small files.
 
         Args:
             folder: Where they go; it may be the store's own folder.
 
         Returns:
-            The files but for the policies.
+            The files.
         """
         folder.mkdir(parents=True, exist_ok=True)
         abouts = self.provenance
@@ -189,12 +190,10 @@ class Store:
                     statistics=False,
                     row_group_size=max(1, len(rows)),
                 )
-        policies = folder / POLICIES
-        policies.mkdir(exist_ok=True)
-        for path in sorted((self.folder / POLICIES).glob("*.safetensors")):
-            if path.parent.resolve() != policies.resolve():
-                shutil.copy(path, policies)
-        return [folder / name for name in files]
+        own = self.folder / POLICIES
+        found = {name: load_policy(own / f"{name}{SUFFIX}") for name in names(own)}
+        packed = [save_folder(folder / POLICIES, found)] if found else []
+        return [*(folder / name for name in files), *packed]
 
     def _all(self, kind: str) -> pl.DataFrame:
         """All rows of a kind, part by part."""

@@ -3,6 +3,9 @@
 The file is a `safetensors` file (Hugging Face): the mean and the standard deviation of
 the observations, the layers of the policy network, and in its metadata, as JSON, a
 description and a SHA-256 of both. Value network and optimisers stay in the checkpoints.
+
+Many policies are one file too: FOLDER.safetensors takes the place of all the files of
+FOLDER, and FOLDER/NAME.safetensors is still the path of each.
 """
 
 import hashlib
@@ -24,6 +27,10 @@ from rmp_mjx.training.learning.networks import Agent, make_agent, make_networks
 
 KEY = "rmp_mjx_policy"
 """The entry of the metadata that makes a safetensors file a policy."""
+MANY = "rmp_mjx_policies"
+"""The entry of the metadata that makes one a folder of policies."""
+SUFFIX = ".safetensors"
+"""How a policy file's name ends."""
 VERSION = 1
 """Version of the format that this module writes and reads."""
 NORMALIZER, NETWORK = "normalizer", "policy"
@@ -88,43 +95,133 @@ def save_policy(path: Path, agent: Agent, about: Mapping[str, Any]) -> None:
         NETWORK: params,
     }
     arrays = {name: np.asarray(leaf) for name, leaf in _named(parts).items()}
-    head = {"version": VERSION, "about": about, "sha256": _fingerprint(arrays, about)}
+    head = _head(arrays, about)
     with replacing(path) as temporary:
         temporary.write_bytes(save(arrays, {KEY: json.dumps(head)}))
 
 
+def save_folder(folder: Path, policies: Mapping[str, Policy]) -> Path:
+    """Write many policies as one file, FOLDER.safetensors.
+
+    Args:
+        folder: The folder whose place it takes; FOLDER/NAME.safetensors is the path of
+            one of them.
+        policies: They by name.
+
+    Returns:
+        The file.
+    """
+    heads = {name: _head(each.arrays, each.about) for name, each in policies.items()}
+    arrays = {
+        f"{name}/{key}": array
+        for name, each in policies.items()
+        for key, array in each.arrays.items()
+    }
+    path = _packed(folder)
+    with replacing(path) as temporary:
+        temporary.write_bytes(save(arrays, {MANY: json.dumps(heads)}))
+    return path
+
+
+def _packed(folder: Path) -> Path:
+    """The file that takes a folder's place."""
+    return Path(f"{folder}{SUFFIX}")
+
+
+def names(folder: Path) -> list[str]:
+    """Names of the policies of a folder: of its files, and of FOLDER.safetensors.
+
+    Raises:
+        PolicyError: FOLDER.safetensors cannot be read.
+    """
+    packed = _packed(folder)
+    found = {path.stem for path in folder.glob(f"*{SUFFIX}")}
+    if packed.is_file():
+        metadata, _ = _read(packed)
+        found |= set(_parsed(packed, metadata.get(MANY, "{}")))
+    return sorted(found)
+
+
+def is_policy(path: Path) -> bool:
+    """Whether there is a file of that name, or one that takes its folder's place."""
+    if path.is_file():
+        return path.suffix == SUFFIX
+    packed = _packed(path.parent)
+    return (
+        path.suffix == SUFFIX and packed.is_file() and path.stem in names(path.parent)
+    )
+
+
 def load_policy(path: Path) -> Policy:
-    """Read a policy that `save_policy` wrote.
+    """Read a policy that `save_policy` or `save_folder` wrote.
 
     Raises:
         PolicyError: There is no such file, it is damaged, it is something else, or a
             newer version of this project wrote it.
     """
-    if not path.is_file():
+    if path.is_file():
+        metadata, arrays = _read(path)
+        if KEY not in metadata:
+            hint = f"; it holds many: --run {path.with_suffix('')}/NAME"
+            raise PolicyError(
+                f"{path} is a safetensors file, but no policy of rmp_mjx"
+                f"{hint if MANY in metadata else ''}"
+            )
+        return _checked(path, _parsed(path, metadata[KEY]), arrays)
+    if not is_policy(path):
         raise PolicyError(f"{path}: no such policy file")
+    packed = _packed(path.parent)
+    metadata, arrays = _read(packed, f"{path.stem}/")
+    return _checked(path, _parsed(packed, metadata[MANY])[path.stem], arrays)
+
+
+def _read(path: Path, prefix: str = "") -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Metadata of a file, and the arrays whose names begin so, without the prefix."""
     try:
         with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            wanted = [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118
+            arrays = {name[len(prefix) :]: file.get_tensor(name) for name in wanted}
+            return file.metadata() or {}, arrays
     except (SafetensorError, OSError, UnicodeDecodeError) as error:
         raise PolicyError(
             f"{path} is damaged, or no safetensors file: {error}"
         ) from error
-    if KEY not in metadata:
-        raise PolicyError(f"{path} is a safetensors file, but no policy of rmp_mjx")
-    damaged = PolicyError(f"{path} is damaged: its content fails its checksum")
+
+
+def _head(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> dict[str, Any]:
+    """What the metadata says of a policy."""
+    sha256 = _fingerprint(arrays, about)
+    return {"version": VERSION, "about": about, "sha256": sha256}
+
+
+def _parsed(path: Path, text: str) -> dict[str, Any]:
+    """An object of the metadata."""
     try:
-        head = json.loads(metadata[KEY])
+        found = json.loads(text)
+    except ValueError as error:
+        raise _damaged(path) from error
+    if not isinstance(found, dict):
+        raise _damaged(path)
+    return found
+
+
+def _damaged(path: Path) -> PolicyError:
+    return PolicyError(f"{path} is damaged: its content fails its checksum")
+
+
+def _checked(path: Path, head: Any, arrays: dict[str, np.ndarray]) -> Policy:
+    """The policy, if it is of this version and whole."""
+    try:
         version, about, fingerprint = (head[k] for k in ("version", "about", "sha256"))
-    except (ValueError, KeyError, TypeError) as error:
-        raise damaged from error
+    except (KeyError, TypeError) as error:
+        raise _damaged(path) from error
     if version != VERSION:
         raise PolicyError(
             f"{path} has version {version} of the format, this rmp_mjx reads "
             f"{VERSION}: install another version of rmp_mjx"
         )
     if fingerprint != _fingerprint(arrays, about):
-        raise damaged
+        raise _damaged(path)
     return Policy(arrays, about)
 
 

@@ -13,7 +13,13 @@ from safetensors.numpy import load_file, save_file
 
 from rmp_mjx.training import policy
 from rmp_mjx.training.learning.networks import make_agent, make_networks
-from rmp_mjx.training.policy import PolicyError, load_policy, save_policy
+from rmp_mjx.training.policy import (
+    PolicyError,
+    load_policy,
+    names,
+    save_folder,
+    save_policy,
+)
 
 OBS, ACT = 5, 3
 ABOUT = {"config": {"task": "toy", "sizes": [7, 6]}, "iterations": 4}
@@ -58,6 +64,40 @@ def test_what_was_read_is_written_to_the_same_bytes(file, tmp_path):
     save_policy(again, found.agent(OBS, ACT, True), found.about)
     assert again.read_bytes() == file.read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == [again.name, file.name]
+
+
+def test_policies_in_one_file_have_the_paths_of_a_folder(file):
+    one = load_policy(file)
+    other = dataclasses.replace(one, about={"iterations": 5})
+    folder = file.parent / "kept"
+    assert save_folder(folder, {"a": one, "b": other}) == file.parent / (
+        "kept.safetensors"
+    )
+    assert names(folder) == ["a", "b"]
+    for name, wanted in (("a", one), ("b", other)):
+        found = load_policy(folder / f"{name}.safetensors")
+        assert found.about == wanted.about
+        jax.tree.map(np.testing.assert_array_equal, found.arrays, wanted.arrays)
+    with pytest.raises(PolicyError, match="no such policy file"):
+        load_policy(folder / "c.safetensors")
+    with pytest.raises(PolicyError, match=r"it holds many: --run .*kept/NAME"):
+        load_policy(file.parent / "kept.safetensors")
+    folder.mkdir()
+    save_policy(folder / "b.safetensors", one.agent(OBS, ACT, True), one.about)
+    assert load_policy(folder / "b.safetensors").about == ABOUT  # an own file is first
+    assert names(folder) == ["a", "b"]
+
+
+def test_a_flipped_bit_in_a_file_of_many_is_refused(file):
+    one = load_policy(file)
+    packed = save_folder(file.parent / "kept", {"a": one})
+    whole = packed.read_bytes()
+    for place in range(0, len(whole), 7):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1
+        packed.write_bytes(damaged)
+        with pytest.raises(PolicyError):
+            load_policy(file.parent / "kept" / "a.safetensors")
 
 
 def test_other_libraries_find_arrays_with_plain_names(file):

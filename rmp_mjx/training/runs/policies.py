@@ -10,11 +10,10 @@ from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.networks import Agent, make_agent
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.learning.rollout import Env
-from rmp_mjx.training.policy import load_policy, save_policy
+from rmp_mjx.training.policy import SUFFIX, is_policy, load_policy, save_policy
 from rmp_mjx.training.runs import identity, run_folder
 from rmp_mjx.training.runs.checkpoint import NEWEST, Checkpointer
 
-SUFFIX = ".safetensors"
 CONDITIONS = ("episodes", "task", "deterministic", "engine")
 """Names in an evaluation that say how it was made."""
 RATE = "_rate"
@@ -26,13 +25,15 @@ MEAN = "return_mean"
 def find(run: str) -> Path:
     """The run folder or the policy file of a name; NAME may stand for NAME.safetensors.
 
+    FOLDER/NAME is also found in FOLDER.safetensors, a file of many policies.
+
     Raises:
         ConfigError: There is neither.
     """
     path = Path(run)
     file = path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
     for found in (path, file):
-        if found.is_dir() or (found.is_file() and found.suffix == SUFFIX):
+        if found.is_dir() or is_policy(found):
             return found
     raise ConfigError(f"{run} is neither a run folder nor a policy file ({file.name})")
 
@@ -72,7 +73,7 @@ def load_agent(
         ConfigError: The policy was trained in another environment.
         PolicyError: The policy file cannot be used, or not for this environment.
     """
-    if path.is_file():
+    if not path.is_dir():
         policy = load_policy(path)
         identity.check(policy.about.get(identity.KEY, {}), env, path)
         agent = policy.agent(env.observation_size, env.action_size, deterministic)

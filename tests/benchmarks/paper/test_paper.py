@@ -35,6 +35,7 @@ from envs.cli import make_config
 from envs.types import METRICS
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.policy import load_policy
 from rmp_mjx.training.runs import run_folder, saving
 from tests.training.toys import ToyState
 
@@ -319,6 +320,9 @@ def test_what_is_packed_is_done_and_a_new_part_comes_before_it(
     grid[0].pack(tmp_path)
     place, cell = Store(tmp_path), Cell("door", "vices", 0)
     assert place.provenance == grid[0].provenance
+    assert not (tmp_path / "policies").exists()  # one file has them all
+    found, wanted = (load_policy(each.policy(cell)) for each in (place, grid[0]))
+    assert found.about == wanted.about
     assert training.run(place, TINY, TINY.cells(), QUIET) == 0
     rows = measures.of(grid[0].episodes, task="door", variant="vices", seed=0)
     rows = rows.filter(column="free").with_columns(pl.lit(7.0).alias("return"))
