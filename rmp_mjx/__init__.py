@@ -4,6 +4,7 @@ from rmp_mjx.control import ACTION_SIZE as ACTION_SIZE
 from rmp_mjx.control import RMPVICES as RMPVICES
 from rmp_mjx.control import VICES as VICES
 from rmp_mjx.control import ActionRange as ActionRange
+from rmp_mjx.control import ContactObserver as ContactObserver
 from rmp_mjx.control import Controller as Controller
 from rmp_mjx.control import Leaves as Leaves
 from rmp_mjx.control import OrientationRelaxation as OrientationRelaxation

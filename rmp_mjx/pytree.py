@@ -137,8 +137,10 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, Tracer) or isinstance(b, Tracer):
         return False
     kind = _kind(a)
-    if kind is None or kind != _kind(b):
-        return kind is None and bool(a == b)
+    if kind != _kind(b):
+        return False
+    if kind is None:
+        return bool(a == b)
     if jnp.issubdtype(kind[0], jax.dtypes.prng_key):
         a, b = jax.random.key_data(a), jax.random.key_data(b)
     a, b = np.asarray(a), np.asarray(b)

@@ -164,6 +164,7 @@ def test_printing_leaves_out_defaults_and_shortens_what_is_long():
     assert repr(Gain(jax.random.key(0))) == "Gain(value=key<fry>[])"
     assert repr(Gain(jnp.zeros((0, 3)))) == "Gain(value=float32[0, 3])"
     assert repr(Gain(jnp.sin)) == "Gain(value=sin)"
+    assert repr(Pair(1.0, 2.0, np.arange(6.0))).endswith("more=float64[6])")
     assert repr(pair()) == (
         "Pair(gain=Gain(value=2.0), array=float64[6], more={'a': (1, None)})"
     )

@@ -7,6 +7,7 @@ from rmp_mjx.control.controller import Controller as Controller
 from rmp_mjx.control.dither import SetpointDither as SetpointDither
 from rmp_mjx.control.leaves import Leaves as Leaves
 from rmp_mjx.control.literal import rmp_vices_literal as rmp_vices_literal
+from rmp_mjx.control.observer import ContactObserver as ContactObserver
 from rmp_mjx.control.relaxation import OrientationRelaxation as OrientationRelaxation
 from rmp_mjx.control.rmp_vices import RMPVICES as RMPVICES
 from rmp_mjx.control.vices import VICES as VICES
