@@ -24,7 +24,7 @@ from rich.table import Table
 
 import rmp_mjx as rmp
 from rmp_mjx import runtime
-from rmp_mjx.control.torque import scale_torque
+from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
@@ -316,13 +316,13 @@ def insert(text: str, tables: Mapping[str, str]) -> str:
 class AutodiffRMPVICES(rmp.RMPVICES):
     """The definition of the controller, at time 0 of the set-point: without dither."""
 
-    def __call__(self, q, qd, setpoint, obstacles):
+    def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
         """Torque for one state.
 
         The weight of the orientation is the closed form's. Compiled, nothing else of
         that is left.
         """
-        out = super().__call__(q, qd, setpoint, obstacles)
+        out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
         q, qd = jnp.asarray(q), jnp.asarray(qd)
         Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
         tree = rmp_vices_tree(
@@ -337,6 +337,9 @@ class AutodiffRMPVICES(rmp.RMPVICES):
         root = rmp.evaluate(tree, q, qd)
         qdd = rmp.resolve(root, self.regularizer * Mq)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
-        tau, scale = scale_torque(dynamic, bias, jnp.asarray(self.robot.tau_max))
-        diagnostics = out.diagnostics | {"torque_scale": scale}
-        return rmp.ControlOutput(tau, qdd, root.f, root.M, diagnostics)
+        low, high = torque_range(self.robot, tau_last, self.period)
+        tau, limit = clip_torque(dynamic + bias, low, high)
+        diagnostics = out.diagnostics | {"torque_limit": limit}
+        return out.replace(
+            tau=tau, qdd=qdd, f=root.f, M=root.M, diagnostics=diagnostics
+        )

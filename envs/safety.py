@@ -222,7 +222,7 @@ def observe(
     state: PhysicsState,
     torques: Torques,
     motion: Motion,
-    torque_scale: Float[Array, ""],
+    torque_limit: Float[Array, " n"],
 ) -> SafetyRecord:
     """The record of the physics step that led to `state`.
 
@@ -232,7 +232,7 @@ def observe(
         state: Physics after the step.
         torques: Torques up to this step.
         motion: Velocities up to this step.
-        torque_scale: Below 1 where a torque was at its limit.
+        torque_limit: Not 0 where a torque was at its limit, (n,).
     """
     contacts = read_contacts(scene.model, state)
     q = state.qpos[: robot.n]
@@ -252,7 +252,7 @@ def observe(
         contact_force_peak=jnp.max(unwanted, initial=0.0),
         work_force=work,
         work_force_peak=work,
-        torque_saturation=(torque_scale < 1.0).astype(q.dtype),
+        torque_saturation=jnp.any(torque_limit != 0.0).astype(q.dtype),
         torque_jump=jnp.max(jnp.abs(torques.change)),
         torque_reversals=torques.reversed.astype(q.dtype),
         joint_jerk=jnp.max(jnp.abs(motion.jerk)),

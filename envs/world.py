@@ -156,7 +156,7 @@ class World(Task[OptionsT]):
                 data,
                 torques := torques.then(out.tau),
                 motion := motion.then(data.qvel[:n], self.sim_dt),
-                out.diagnostics["torque_scale"],
+                out.diagnostics["torque_limit"],
             )
             record = record.then(now, 1.0 / self.n_substeps)
             return (data, spheres, torques, motion, record), None

@@ -45,11 +45,16 @@ class ControlOutput(Pytree):
     tau: Float[Array, " n"]
     """Joint torques within the actuator limits [N m]."""
     qdd: Float[Array, " n"]
-    """Desired joint acceleration, before the torque limits [rad/s^2]."""
+    """Joint acceleration that the torque gives while nothing touches [rad/s^2]."""
     f: Float[Array, " n"]
     """Force of the root RMP (natural form)."""
     M: Float[Array, "n n"]
     """Metric of the root RMP (natural form), without the regulariser."""
+    Mq: Float[Array, "n n"]
+    """Inertia of the arm in this state [kg m^2]."""
+    bias: Float[Array, " n"]
+    """Coriolis and gravity torques in this state [N m]: the model is
+    ``Mq qdd + bias = tau + tau_ext``."""
     diagnostics: dict[str, Any]
-    """Scalars by name. Every controller has `torque_scale` in [0, 1] (1 = no
-    saturation). The controller documents the others."""
+    """By name. Every controller has `torque_limit` (n,): -1 or 1 where a torque is at
+    its lower or upper limit, else 0. The controller documents the others."""

@@ -21,8 +21,8 @@ from benchmarks.common import Row, insert, markdown, show, write_json
 from benchmarks.studies.safety_study import ENDING, EVENTS, Group, Study
 from envs.placement import LAYOUTS
 from rmp_mjx import runtime
-from rmp_mjx.control.torque import clip_torque
-from rmp_mjx.rmp import ScalarLeaf
+from rmp_mjx.control.torque import clip_torque, torque_range
+from rmp_mjx.rmp import RMP, ScalarLeaf, resolve
 from rmp_mjx.rmp.leaves import (
     Barrier,
     JointLimitBarrier,
@@ -32,8 +32,6 @@ from rmp_mjx.rmp.leaves import (
     collision_transit,
 )
 from rmp_mjx.rmp.leaves.joint_limit import joint_limit_barrier
-from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import arm_state
 
 Figures = dict[str, np.ndarray]
 Make = Callable[[rmp.Robot], rmp.Controller]
@@ -105,13 +103,13 @@ class _NoCurvature(Barrier):
 class _Clipped(rmp.RMPVICES):
     """RMP-VICES that clips each torque separately."""
 
-    def __call__(self, q, qd, setpoint, obstacles):
-        out = super().__call__(q, qd, setpoint, obstacles)
-        q, qd = jnp.asarray(q), jnp.asarray(qd)
-        Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
-        tau, scale = clip_torque(Mq @ out.qdd + bias, self.robot.tau_max)
+    def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
+        out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
+        free = resolve(RMP(out.f, out.M), self.regularizer * out.Mq)
+        low, high = torque_range(self.robot, tau_last, self.period)
+        tau, limit = clip_torque(out.Mq @ free + out.bias, low, high)
         return out.replace(
-            tau=tau, diagnostics=out.diagnostics | {"torque_scale": scale}
+            tau=tau, diagnostics=out.diagnostics | {"torque_limit": limit}
         )
 
 

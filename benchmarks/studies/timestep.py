@@ -112,9 +112,9 @@ def _roll_out(env, starts, actions) -> dict[str, Any]:
             out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, obstacles)
             after = env.physics.step(data, out.tau)
             torques = torques.then(out.tau)
-            scale = out.diagnostics["torque_scale"]
+            limit = out.diagnostics["torque_limit"]
             motion = Motion.start(after.qvel[:n])  # its jerk is not used
-            now = observe(env.scene, env.robot, after, torques, motion, scale)
+            now = observe(env.scene, env.robot, after, torques, motion, limit)
             jump = jnp.maximum(jump, now.torque_jump)
             force = jnp.maximum(force, now.contact_force_peak)
             return (after, torques, event | now.event, force, jump), None

@@ -45,14 +45,21 @@ def check(name: str, value: Any, shape: tuple[int, ...], kind: str = "float") ->
     )
 
 
-def check_state(n: int, q: Any, qd: Any) -> None:
-    """Refuse joint positions and velocities that are not (n,) floats.
+def check_state(
+    n: int, q: Any, qd: Any, tau_ext: Any = None, tau_last: Any = None
+) -> None:
+    """Refuse joint positions, velocities and torques that are not (n,) floats.
+
+    The torques may be None.
 
     Raises:
         ValueError: See `check`.
     """
-    check("q", q, (n,))
-    check("qd", qd, (n,))
+    for name, value in {"q": q, "qd": qd}.items():
+        check(name, value, (n,))
+    for name, value in {"tau_ext": tau_ext, "tau_last": tau_last}.items():
+        if value is not None:
+            check(name, value, (n,))
 
 
 def check_action(action: Any) -> None:

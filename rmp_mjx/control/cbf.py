@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from rmp_mjx.control.avoidance import self_gaps
-from rmp_mjx.control.torque import clip_torque
+from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.control.vices import VICES
 from rmp_mjx.math import cholesky, psd_solve, solve_lower
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
-from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, arm_state, base_point
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import point_state
@@ -83,6 +82,8 @@ class FilteredVICES(VICES):
         qd: Float[ArrayLike, " n"],
         setpoint: Setpoint,
         obstacles: Obstacles,
+        tau_ext: Float[ArrayLike, " n"] | None = None,
+        tau_last: Float[ArrayLike, " n"] | None = None,
     ) -> ControlOutput:
         """Torque for one state; same signature as `RMPVICES`.
 
@@ -93,21 +94,20 @@ class FilteredVICES(VICES):
         Raises:
             ValueError: An argument has a wrong shape or dtype.
         """
-        tau = super().__call__(q, qd, setpoint, obstacles).tau
-        q, qd = jnp.asarray(q), jnp.asarray(qd)
+        out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
+        q, qd, Mq, bias = jnp.asarray(q), jnp.asarray(qd), out.Mq, out.bias
         arm = arm_state(self.robot, q, qd)
-        Mq, bias = dynamics(self.robot, arm)
-        wanted = psd_solve(Mq, tau - bias)
+        wanted = psd_solve(Mq, out.tau - bias)
         barriers = self.barriers(arm, q, qd, obstacles)
         qdd, solved = self._filter(wanted, barriers, Mq, bias)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
-        tau, scale = clip_torque(dynamic + bias, jnp.asarray(self.robot.tau_max))
-        return ControlOutput(
+        low, high = torque_range(self.robot, tau_last, self.period)
+        tau, limit = clip_torque(dynamic + bias, low, high)
+        return out.replace(
             tau=tau,
             qdd=qdd,
             f=dynamic,
-            M=Mq,
-            diagnostics={"torque_scale": scale, "solved": solved},
+            diagnostics={"torque_limit": limit, "solved": solved},
         )
 
     def barriers(

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.arguments import check, check_action
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.pytree import Pytree
+from rmp_mjx.pytree import Constant, Pytree
 from rmp_mjx.robot.kinematics import site_pose
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
@@ -41,8 +41,15 @@ class Controller(Protocol):
         qd: Float[Array, " n"],
         setpoint: Any,
         obstacles: Obstacles,
+        tau_ext: Float[Array, " n"] | None = None,
+        tau_last: Float[Array, " n"] | None = None,
     ) -> ControlOutput:
-        """Torque for joint positions [rad] and velocities [rad/s]."""
+        """Torque for joint positions [rad] and velocities [rad/s].
+
+        `tau_ext` is the joint torque of the contacts [N m] as far as it is known, and
+        `tau_last` the torque of the last control step [N m], which matters where the
+        robot has a limit of its rate.
+        """
         ...
 
 
@@ -53,6 +60,8 @@ class ImpedanceController(Pytree):
     """The arm."""
     action_range: ActionRange = struct.field(default_factory=ActionRange, kw_only=True)
     """Physical meaning of a policy action in [-1, 1]^12."""
+    period: Float[Constant, ""] | float = struct.field(default=0.005, kw_only=True)
+    """Time between two calls [s], for the limits of speed and torque rate."""
 
     def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
         """Physical units of a policy's action in [-1, 1]^12, (12,).

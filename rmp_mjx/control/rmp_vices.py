@@ -17,7 +17,7 @@ from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.control.dither import SetpointDither
 from rmp_mjx.control.leaves import CollisionLeaf, Leaves
 from rmp_mjx.control.relaxation import OrientationRelaxation, joint_limit_relaxation
-from rmp_mjx.control.torque import scale_torque
+from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp import RMP, pullback, resolve
@@ -80,6 +80,8 @@ class RMPVICES(ImpedanceController):
         qd: Float[ArrayLike, " n"],
         setpoint: Setpoint,
         obstacles: Obstacles,
+        tau_ext: Float[ArrayLike, " n"] | None = None,
+        tau_last: Float[ArrayLike, " n"] | None = None,
     ) -> ControlOutput:
         """Torque for one state.
 
@@ -97,7 +99,7 @@ class RMPVICES(ImpedanceController):
         Raises:
             ValueError: An argument has a wrong shape or dtype.
         """
-        check_state(self.robot.n, q, qd)
+        check_state(self.robot.n, q, qd, tau_ext, tau_last)
         check_setpoint(setpoint)
         check_obstacles(obstacles)
         q, qd = jnp.asarray(q), jnp.asarray(qd)
@@ -117,14 +119,17 @@ class RMPVICES(ImpedanceController):
         root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
         qdd = resolve(root, self.regularizer * Mq)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
-        tau, scale = scale_torque(dynamic, bias, self.robot.tau_max)
+        low, high = torque_range(self.robot, tau_last, self.period)
+        tau, limit = clip_torque(dynamic + bias, low, high)
         return ControlOutput(
             tau=tau,
             qdd=qdd,
             f=root.f,
             M=root.M,
+            Mq=Mq,
+            bias=bias,
             diagnostics={
-                "torque_scale": scale,
+                "torque_limit": limit,
                 "clearance": clearance,
                 "orientation_weight": orientation_weight,
             },

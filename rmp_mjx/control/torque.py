@@ -1,52 +1,45 @@
-"""From a joint acceleration to torques that the actuators can give."""
+"""The torques that the actuators can give, and the nearest one to what is asked."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rmp_mjx.pytree import Constant
+from rmp_mjx.robot.model import Robot
 
 
-def scale_torque(
-    dynamic: Float[Array, " n"],
-    bias: Float[Array, " n"],
-    tau_max: Float[Constant, " n"],
-) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    r"""Torque within the limits that keeps the direction of the acceleration.
-
-    $$
-    \tau = b + k\, M_q \ddot q, \quad k \in [0, 1] \text{ as large as fits.}
-    $$
-
-    Clipping each joint separately would change the direction of the acceleration,
-    perhaps into an obstacle. A bias beyond the limits is clipped.
+def torque_range(
+    robot: Robot,
+    tau_last: Float[ArrayLike, " n"] | None,
+    period: Float[Constant, ""] | float,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """The torques that the actuators can give next, by their limits and their rate.
 
     Args:
-        dynamic: Mq qdd, (n,) [N m].
-        bias: Coriolis and gravity, (n,) [N m].
-        tau_max: Actuator limits, (n,) [N m].
+        robot: The arm, with `tau_max` and perhaps `tau_rate_max`.
+        tau_last: Torque of the last control step, (n,) [N m]; None: the rate is free.
+        period: Time since then [s].
 
     Returns:
-        Torque (n,) [N m] and the scale k.
+        Lowest and highest torque, (n,) each [N m].
     """
-    bias = jnp.clip(bias, -tau_max, tau_max)
-    room = tau_max - jnp.sign(dynamic) * bias
-    size = jnp.abs(dynamic)
-    fits = size <= room
-    k = jnp.min(jnp.where(fits, 1.0, room / jnp.where(fits, 1.0, size)))
-    return jnp.clip(bias + k * dynamic, -tau_max, tau_max), k
+    high = jnp.asarray(robot.tau_max)
+    if robot.tau_rate_max is None or tau_last is None:
+        return -high, high
+    last = jnp.clip(jnp.asarray(tau_last), -high, high)
+    step = jnp.asarray(robot.tau_rate_max) * period
+    return jnp.maximum(last - step, -high), jnp.minimum(last + step, high)
 
 
 def clip_torque(
-    tau: Float[Array, " n"], tau_max: Float[Constant, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    tau: Float[Array, " n"], low: Float[Array, " n"], high: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Clip each joint separately, as VICES and robosuite do.
 
     Returns:
-        Torque (n,) [N m] and the least fraction of a demanded torque that is met.
+        Torque (n,) [N m], and -1 or 1 where it is at its lowest or highest value, else
+        0, (n,).
     """
-    clipped = jnp.clip(tau, -tau_max, tau_max)
-    size = jnp.abs(tau)
-    over = size > tau_max
-    return clipped, jnp.min(jnp.where(over, tau_max / jnp.where(over, size, 1.0), 1.0))
+    limit = (tau >= high).astype(tau.dtype) - (tau <= low).astype(tau.dtype)
+    return jnp.clip(tau, low, high), limit

@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rmp_mjx.control.arguments import check_obstacles, check_setpoint, check_state
 from rmp_mjx.control.controller import ImpedanceController
-from rmp_mjx.control.torque import clip_torque
+from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.math import critical_damping, orientation_error, psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
@@ -41,17 +41,22 @@ class VICES(ImpedanceController):
         qd: Float[ArrayLike, " n"],
         setpoint: Setpoint,
         obstacles: Obstacles,
+        tau_ext: Float[ArrayLike, " n"] | None = None,
+        tau_last: Float[ArrayLike, " n"] | None = None,
     ) -> ControlOutput:
         """Torque for one state; same signature as `RMPVICES`.
 
+        It ignores the contacts' torque. The torque's rate is clipped where the robot
+        has a limit of it.
+
         Returns:
             Torque, the acceleration it gives, that acceleration as an RMP in the
-            inertia metric, and diagnostics: `torque_scale` in [0, 1].
+            inertia metric, and the diagnostics that all controllers have.
 
         Raises:
             ValueError: An argument has a wrong shape or dtype.
         """
-        check_state(self.robot.n, q, qd)
+        check_state(self.robot.n, q, qd, tau_ext, tau_last)
         check_setpoint(setpoint)
         check_obstacles(obstacles)
         q, qd = jnp.asarray(q), jnp.asarray(qd)
@@ -74,13 +79,16 @@ class VICES(ImpedanceController):
         qdd_0 = Posture(self.robot.q_home, kq=self.kq).acceleration(q, qd)
         null = _dot(Mq, qdd_0) - _dot(J.T, psd_solve(G, _dot(J, qdd_0)))
         dynamic = _dot(J.T, wrench) + null
-        tau, scale = clip_torque(dynamic + bias, jnp.asarray(self.robot.tau_max))
+        low, high = torque_range(self.robot, tau_last, self.period)
+        tau, limit = clip_torque(dynamic + bias, low, high)
         return ControlOutput(
             tau=tau,
             qdd=psd_solve(Mq, dynamic),
             f=dynamic,
             M=Mq,
-            diagnostics={"torque_scale": scale},
+            Mq=Mq,
+            bias=bias,
+            diagnostics={"torque_limit": limit},
         )
 
 

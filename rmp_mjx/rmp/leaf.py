@@ -25,9 +25,29 @@ class Leaf(Pytree, abc.ABC):
     def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
         """The leaf's RMP at ``x``, ``xd``: f (m,), M (m, m)."""
 
+    def against(
+        self, x: Float[Array, " m"], xd: Float[Array, " m"], push: Float[Array, " m"]
+    ) -> RMP:
+        """The leaf's RMP where contacts accelerate the coordinate by ``push``, (m,).
+
+        A leaf takes no notice, unless it keeps something safe.
+        """
+        del push
+        return self(x, xd)
+
 
 class ScalarLeaf(Leaf):
-    """A leaf that acts on every coordinate separately (diagonal metric)."""
+    r"""A leaf that acts on every coordinate separately (diagonal metric).
+
+    The coordinates of a collision leaf are distances, which contacts may shorten. Then
+    the leaf asks for its acceleration on top of what they take,
+
+    $$
+    f \leftarrow f + m \max(-\ddot x_{contact}, 0) .
+    $$
+
+    A leaf whose coordinates are no distances overrides `scalar_against`.
+    """
 
     @abc.abstractmethod
     def scalar(
@@ -38,4 +58,18 @@ class ScalarLeaf(Leaf):
     def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
         """The same policy as an RMP with metric ``diag(m)``."""
         f, m = self.scalar(x, xd)
+        return RMP(f=f, M=jnp.diag(m))
+
+    def scalar_against(
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"], push: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
+        """As `scalar`, where contacts accelerate the coordinates by ``push``."""
+        f, m = self.scalar(x, xd)
+        return f + m * jnp.maximum(-push, 0.0), m
+
+    def against(
+        self, x: Float[Array, " m"], xd: Float[Array, " m"], push: Float[Array, " m"]
+    ) -> RMP:
+        """As `scalar_against`, with metric ``diag(m)``."""
+        f, m = self.scalar_against(x, xd, push)
         return RMP(f=f, M=jnp.diag(m))

@@ -48,7 +48,10 @@ class Siblings(Pytree):
 
 
 def evaluate(
-    node: Node | Siblings | Leaf, x: Float[Array, " n"], xd: Float[Array, " n"]
+    node: Node | Siblings | Leaf,
+    x: Float[Array, " n"],
+    xd: Float[Array, " n"],
+    push: Float[Array, " n"] | None = None,
 ) -> RMP:
     """Evaluate a tree: push states to the leaves, pull their policies back and add.
 
@@ -56,6 +59,7 @@ def evaluate(
         node: A tree, or any part of one.
         x: Coordinate of the node's parent (of the root: q), (n,).
         xd: Its velocity, (n,).
+        push: Its acceleration by contacts, (n,); None: nothing touches.
 
     Returns:
         The RMP on the parent's coordinate; f (n,), M (n, n). Feed the root's to
@@ -67,15 +71,18 @@ def evaluate(
         axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, node.child)
         if all(axis is None for axis in jax.tree.leaves(axes, is_leaf=_is_none)):
             raise ValueError("Siblings: no array in the child carries a leading axis")
-        stacked = jax.vmap(evaluate, in_axes=(axes, None, None))(node.child, x, xd)
+        along = jax.vmap(evaluate, in_axes=(axes, None, None, None))
+        stacked = along(node.child, x, xd, push)
         return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), stacked)
     if isinstance(node, Node):
         if not node.children:
             return RMP.zero(x.shape[0], x.dtype)
         pushed = pushforward(node.psi, x, xd)
-        rmps = [evaluate(child, pushed.x, pushed.xd) for child in node.children]
+        if push is not None:
+            push = jnp.matmul(pushed.J, push, precision="highest")
+        rmps = [evaluate(child, pushed.x, pushed.xd, push) for child in node.children]
         return pullback(functools.reduce(operator.add, rmps), pushed.J, pushed.Jdot_qd)
-    return node(x, xd)
+    return node(x, xd) if push is None else node.against(x, xd, push)
 
 
 def _is_none(axis: object) -> bool:

@@ -38,3 +38,15 @@ def vector(name: str, given: Numbers, size: int) -> np.ndarray:
     if x.shape != (size,) or not np.all(np.isfinite(x)):
         raise RobotError(f"{name} must be {size} finite numbers, got {x.tolist()}")
     return x
+
+
+def positive(name: str, given: Numbers, size: int) -> np.ndarray:
+    """The numbers as an array (size,), all of them positive.
+
+    Raises:
+        RobotError: They are not that many, not finite, or not positive.
+    """
+    x = vector(name, given, size)
+    if np.min(x, initial=np.inf) <= 0:
+        raise RobotError(f"{name} must be positive, got {x.tolist()}")
+    return x

@@ -22,7 +22,7 @@ from rmp_mjx.robot.control_points import (
     touching_pairs,
 )
 from rmp_mjx.robot.end_effector import end_effector
-from rmp_mjx.robot.errors import Numbers, RobotError, vector
+from rmp_mjx.robot.errors import Numbers, RobotError, positive, vector
 from rmp_mjx.robot.fingerprint import fingerprint
 from rmp_mjx.robot.links import carriers, frame_with_z, lumped_inertias, segments
 from rmp_mjx.robot.mjcf import (
@@ -102,6 +102,10 @@ class Robot(Pytree):
     """The MJCF model's name."""
     assets: tuple[tuple[str, bytes], ...] = struct.field(pytree_node=False, default=())
     """Meshes and textures that exist in memory only: (file name, content)."""
+    qd_max: Float[Constant, " n"] | None = None
+    """Limits of the joint speeds [rad/s or m/s]; None for none."""
+    tau_rate_max: Float[Constant, " n"] | None = None
+    """Limits of the torques' rates [N m/s or N/s]; None for none."""
     damping: Float[Constant, " n"] | None = None
     """Viscous damping that the controllers compensate; None for none
     [N m s/rad or N s/m]."""
@@ -189,6 +193,8 @@ class Robot(Pytree):
         offset: Numbers = (0.0, 0.0, 0.0),
         armature: Numbers | None = None,
         torque_limits: Numbers | None = None,
+        velocity_limits: Numbers | None = None,
+        torque_rate_limits: Numbers | None = None,
         q_home: Numbers | None = None,
         compensate_passive: bool = True,
         spacing: float = SPACING,
@@ -208,6 +214,10 @@ class Robot(Pytree):
             offset: End effector's position in that body's frame, (3,) [m].
             armature: Rotor inertias that replace the file's, (n,) [kg m^2].
             torque_limits: Actuator limits that replace the file's, (n,) [N m or N].
+            velocity_limits: Limits of the joint speeds, (n,) [rad/s or m/s]; MJCF has
+                none, so that the default is none.
+            torque_rate_limits: Limits of the torques' rates, (n,) [N m/s or N/s];
+                likewise.
             q_home: Nominal posture, (n,) [rad or m]; default keyframe `home`, else the
                 reference pose, with joints at mid-range where that is outside or close
                 to the end of their range.
@@ -265,6 +275,12 @@ class Robot(Pytree):
             q_lower=lower,
             q_upper=upper,
             tau_max=model.actuator_ctrlrange[:, 1].copy(),
+            qd_max=None
+            if velocity_limits is None
+            else positive("velocity_limits", velocity_limits, len(joints)),
+            tau_rate_max=None
+            if torque_rate_limits is None
+            else positive("torque_rate_limits", torque_rate_limits, len(joints)),
             mass=mass,
             com=com,
             inertia=inertia,

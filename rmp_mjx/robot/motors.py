@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from rmp_mjx.robot.errors import Numbers, RobotError, vector, warn
+from rmp_mjx.robot.errors import Numbers, RobotError, positive, warn
 
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
@@ -48,9 +48,7 @@ def make_motors(
             for name, group in zip(joints, groups, strict=True)
         ]
     else:
-        limits = vector("torque_limits", given, len(joints)).tolist()
-        if min(limits) <= 0:
-            raise RobotError(f"torque_limits must be positive, got {limits}")
+        limits = positive("torque_limits", given, len(joints)).tolist()
         for name in joints:  # else the simulation would still apply the file's
             if model.jnt_actfrclimited[model.joint(name).id]:
                 spec.joint(name).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE

@@ -51,7 +51,7 @@ def test_controllers_have_one_interface(robot, name):
         return ctrl(q, q, setpoint, near)
 
     out = jax.eval_shape(step, jnp.zeros(3), jnp.zeros(12), 0.0)
-    assert out.diagnostics["torque_scale"].shape == ()
+    assert out.diagnostics["torque_limit"].shape == (3,)
     assert [x.shape for x in (out.tau, out.qdd, out.f)] == [(3,)] * 3
     assert out.M.shape == (3, 3)
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(out))

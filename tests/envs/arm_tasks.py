@@ -28,7 +28,7 @@ class Torques(Pytree):
     def setpoint(self, q, action, time):
         return Setpoint(jnp.zeros(3), jnp.eye(3), action[:3], action[3:6], time)
 
-    def __call__(self, q, qd, setpoint, obstacles):
+    def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
         push = jnp.concatenate([setpoint.kp_pos, setpoint.kp_ori, jnp.zeros(1)])
         tau = jnp.asarray(self.hold) + push
         return ControlOutput(
@@ -36,7 +36,9 @@ class Torques(Pytree):
             qdd=tau,
             f=tau,
             M=jnp.eye(7),
-            diagnostics={"torque_scale": jnp.where(push[5] > 0.0, 0.5, 1.0)},
+            Mq=jnp.eye(7),
+            bias=jnp.zeros(7),
+            diagnostics={"torque_limit": jnp.where(push[5] > 0.0, jnp.eye(7)[0], 0.0)},
         )
 
 

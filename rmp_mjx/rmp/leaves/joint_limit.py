@@ -39,6 +39,15 @@ class JointLimitBarrier(ScalarLeaf):
         f_upper, m_upper = self.barrier.scalar(self.upper - x, -xd)
         return f_lower - f_upper, m_lower + m_upper
 
+    def scalar_against(
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"], push: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
+        """As `scalar`, where contacts accelerate the joints by ``push``."""
+        barrier = self.barrier
+        f_lower, m_lower = barrier.scalar_against(x - self.lower, xd, push)
+        f_upper, m_upper = barrier.scalar_against(self.upper - x, -xd, -push)
+        return f_lower - f_upper, m_lower + m_upper
+
 
 def _span(
     lower: Float[Constant, "*s"], upper: Float[Constant, "*s"]
@@ -109,3 +118,10 @@ class RMPflowJointLimit(ScalarLeaf):
         f = m * (self.gamma_p * (q_0 - q) - self.gamma_d * xd)
         f = f - 0.5 * self.lam * slope * xd * xd
         return jnp.where(limited, f, 0.0), jnp.where(limited, m, 0.0)
+
+    def scalar_against(
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"], push: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
+        """As `scalar`: RMPflow's leaf takes no notice of contacts."""
+        del push
+        return self.scalar(x, xd)
