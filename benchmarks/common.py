@@ -24,10 +24,10 @@ from rich.table import Table
 
 import rmp_mjx as rmp
 from rmp_mjx import runtime
-from rmp_mjx.control.torque import clip_torque, torque_range
+from rmp_mjx.control.contact import turning_by_contact
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import arm_state
+from rmp_mjx.robot.kinematics import arm_state, site_state
 from rmp_mjx.training.learning import devices
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -319,27 +319,29 @@ class AutodiffRMPVICES(rmp.RMPVICES):
     def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
         """Torque for one state.
 
-        The weight of the orientation is the closed form's. Compiled, nothing else of
-        that is left.
+        The weights of this state are the closed form's. Compiled, nothing else of that
+        is left.
         """
         out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
         q, qd = jnp.asarray(q), jnp.asarray(qd)
-        Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
+        arm = arm_state(self.robot, q, qd)
+        Mq, bias = dynamics(self.robot, arm)
+        weights, w, turning = out.diagnostics, None, 0.0
+        if tau_ext is not None and self.contact is not None:
+            w = self.contact.acceleration(Mq, jnp.asarray(tau_ext))
+            turning = turning_by_contact(site_state(self.robot, arm), Mq, w)
         tree = rmp_vices_tree(
             self.robot,
-            self.leaves,
+            self.leaves.braking(weights["stop_time"]),
             setpoint,
             obstacles,
             Mq,
-            self.attractor_weight,
-            out.diagnostics["orientation_weight"],
+            self.attractor_weight * weights["attractor_weight"],
+            weights["orientation_weight"],
+            turning,
         )
-        root = rmp.evaluate(tree, q, qd)
-        qdd = rmp.resolve(root, self.regularizer * Mq)
-        dynamic = jnp.matmul(Mq, qdd, precision="highest")
-        low, high = torque_range(self.robot, tau_last, self.period)
-        tau, limit = clip_torque(dynamic + bias, low, high)
-        diagnostics = out.diagnostics | {"torque_limit": limit}
+        root = rmp.evaluate(tree, q, qd, w)
+        qdd, tau, limits = self.resolve(root, Mq, bias, qd, w, tau_last)
         return out.replace(
-            tau=tau, qdd=qdd, f=root.f, M=root.M, diagnostics=diagnostics
+            tau=tau, qdd=qdd, f=root.f, M=root.M, diagnostics=weights | limits
         )

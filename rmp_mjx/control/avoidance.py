@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rmp_mjx.control.leaves import CollisionLeaf, leaf_of
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp import RMP, ScalarLeaf
 from rmp_mjx.rmp.leaf import Param
 from rmp_mjx.robot.kinematics import (
@@ -18,6 +20,7 @@ from rmp_mjx.robot.kinematics import (
     Motion,
     base_point,
     carry_points,
+    motion_of,
     select,
 )
 from rmp_mjx.robot.model import Robot
@@ -34,35 +37,72 @@ def per_link(
     return jnp.asarray(values)[np.array(robot.points.segment, int)]
 
 
+class Surroundings(NamedTuple):
+    """What the collision leaves meet."""
+
+    clearance: dict[str, Float[Array, ""]]
+    """Least distance to each kind of obstacle there are slots for [m]; inf if none of
+    them is in use."""
+    pressed: Float[Array, ""]
+    """Greatest acceleration of a near point towards an obstacle by contacts [m/s^2]."""
+
+
 def obstacle_branch(
-    robot: Robot, arm: ArmState, obstacles: Obstacles, leaf: CollisionLeaf
-) -> tuple[RMP, dict[str, Float[Array, ""]]]:
+    robot: Robot,
+    arm: ArmState,
+    obstacles: Obstacles,
+    leaf: CollisionLeaf,
+    w: Float[Array, " n"] | None = None,
+    near: Float[Constant, ""] | float = 0.0,
+) -> tuple[RMP, Surroundings]:
     """Collision leaves between every control point and every obstacle.
 
     Distances are mapped to points (their RMPs summed over the obstacles, a 3-vector
     and a 3x3 matrix each), points to joints.
 
+    Args:
+        robot: The arm.
+        arm: Its state.
+        obstacles: The obstacles.
+        leaf: The leaf, or one for each kind.
+        w: Joint acceleration by contacts, (n,) [rad/s^2]; None: nothing touches.
+        near: Distance within which a point counts as near [m].
+
     Returns:
-        The RMP on the joints, and the least distance to each kind of obstacle there
-        are slots for [m] (inf if none is in use).
+        The RMP on the joints, and what is about.
     """
     points = point_state(robot, arm)
     origin = base_point(robot)
     world = points.x + Vec(origin[0], origin[1], origin[2])
     rho = jnp.asarray(robot.points.radius, arm.p.dtype)
-    total, clearance = None, {}
+    total, clearance, pressed = None, {}, jnp.zeros((), arm.p.dtype)
+    push = None if w is None else _accelerations(robot, arm, points.x, w)
     gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
     for kind, gap in gaps.items():
         clearance[kind] = jnp.min(
             jnp.where(gap.active, gap.distance, jnp.inf), initial=jnp.inf
         )
         own = leaf_of(leaf, kind)
+        along = None if push is None else gap.normal @ push
+        if along is not None:
+            close = gap.active & (gap.distance < near)
+            pressed = jnp.maximum(
+                pressed, jnp.max(jnp.where(close, -along, 0.0), initial=0.0)
+            )
         if own is not None:
-            rmp = _sum_obstacles(gap, jax.tree.map(_for_all_obstacles, own))
+            rmp = _sum_obstacles(gap, jax.tree.map(_for_all_obstacles, own), along)
             total = rmp if total is None else jax.tree.map(jnp.add, total, rmp)
+    around = Surroundings(clearance, pressed)
     if total is None or not robot.points.segment:
-        return RMP.zero(robot.n, arm.p.dtype), clearance
-    return pull_to_joints(robot, arm, points, total), clearance
+        return RMP.zero(robot.n, arm.p.dtype), around
+    return pull_to_joints(robot, arm, points, total), around
+
+
+def _accelerations(robot: Robot, arm: ArmState, x: Vec, w: Array) -> Vec:
+    """Accelerations of the control points at x by those of the joints, w."""
+    segment = np.array(robot.points.segment, int)
+    carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
+    return select(motion_of(robot, arm.S, w), carrier).at(x)
 
 
 def _for_all_obstacles(parameter: Param) -> Param:
@@ -70,9 +110,9 @@ def _for_all_obstacles(parameter: Param) -> Param:
     return jnp.asarray(parameter)[None] if jnp.ndim(parameter) == 1 else parameter
 
 
-def _sum_obstacles(gap: Gap, leaf: ScalarLeaf) -> PointRMP:
+def _sum_obstacles(gap: Gap, leaf: ScalarLeaf, push: Array | None) -> PointRMP:
     """Pull the leaves back from distances to points and add the obstacles' shares."""
-    f, m = leaf.scalar(gap.distance, gap.rate)
+    f, m = _scalar(leaf, gap.distance, gap.rate, push)
     f = jnp.where(gap.active, f - m * gap.curvature, 0.0)
     m = jnp.where(gap.active, m, 0.0)
     n = gap.normal
@@ -88,8 +128,23 @@ def _sum_obstacles(gap: Gap, leaf: ScalarLeaf) -> PointRMP:
     )
 
 
-def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
+def _scalar(
+    leaf: ScalarLeaf, x: Array, xd: Array, push: Array | None
+) -> tuple[Array, Array]:
+    """Force and metric of the leaf, against contacts if there are any."""
+    return leaf.scalar(x, xd) if push is None else leaf.scalar_against(x, xd, push)
+
+
+def self_branch(
+    robot: Robot, arm: ArmState, leaf: ScalarLeaf, w: Float[Array, " n"] | None = None
+) -> RMP:
     """Collision leaves between the link capsules that can touch.
+
+    Args:
+        robot: The arm.
+        arm: Its state.
+        leaf: The leaf.
+        w: Joint acceleration by contacts, (n,) [rad/s^2]; None: nothing touches.
 
     Returns:
         RMP on the joints; f (n,), M (n, n).
@@ -97,7 +152,8 @@ def self_branch(robot: Robot, arm: ArmState, leaf: ScalarLeaf) -> RMP:
     if not robot.capsules.pairs:
         return RMP.zero(robot.n, arm.p.dtype)
     distance, rate, curvature, rows = self_gaps(robot, arm)
-    f, m = leaf.scalar(distance, rate)
+    push = None if w is None else jnp.matmul(rows, w, precision="highest")
+    f, m = _scalar(leaf, distance, rate, push)
     f, m, rows = materialize(f - m * curvature), materialize(m), materialize(rows)
     return RMP(
         f=jnp.sum(rows * f[:, None], axis=0),

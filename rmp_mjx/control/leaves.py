@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from jaxtyping import Array, Float
+
 from rmp_mjx.names import unknown
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp import ScalarLeaf
@@ -58,6 +60,23 @@ class Leaves(Pytree):
             self_collision=collision_near(),
             joint_limit=JointLimitBarrier(robot.q_lower, robot.q_upper),
             posture=soft_posture(robot.q_home),
+        )
+
+    def braking(self, stop_time: Float[Array, ""] | float) -> Leaves:
+        """The leaves of an arm that needs this time to stop [s]."""
+
+        def slowed(leaf: ScalarLeaf | None) -> ScalarLeaf | None:
+            return None if leaf is None else leaf.braking(stop_time)
+
+        collision = self.collision
+        if isinstance(collision, Mapping):
+            collision = {kind: slowed(leaf) for kind, leaf in collision.items()}
+        else:
+            collision = slowed(collision)
+        return self.replace(
+            collision=collision,
+            self_collision=slowed(self.self_collision),
+            joint_limit=slowed(self.joint_limit),
         )
 
     def with_collision(self, collision: CollisionLeaf | None) -> Leaves:

@@ -51,6 +51,8 @@ def rmp_vices_literal(robot: Robot) -> RMPVICES:
         Leaves(collision=PaperCollision(), joint_limit=limiter),
         obstacle_relaxation=None,
         limit_relaxation=None,
+        contact=None,
         dither=None,
+        braking_share=None,
         regularizer=REGULARIZER,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +12,17 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Float
 
 from rmp_mjx.control.arguments import check_obstacles, check_setpoint, check_state
-from rmp_mjx.control.avoidance import obstacle_branch, self_branch
+from rmp_mjx.control.avoidance import Surroundings, obstacle_branch, self_branch
+from rmp_mjx.control.contact import ContactResponse, turning_by_contact
 from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.control.dither import SetpointDither
 from rmp_mjx.control.leaves import CollisionLeaf, Leaves
 from rmp_mjx.control.relaxation import OrientationRelaxation, joint_limit_relaxation
-from rmp_mjx.control.torque import clip_torque, torque_range
+from rmp_mjx.control.root import Rows, solve_root
+from rmp_mjx.control.torque import clip_torque, speed_range, stop_time, torque_range
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
-from rmp_mjx.rmp import RMP, pullback, resolve
+from rmp_mjx.rmp import RMP, pullback
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_state
@@ -33,14 +35,17 @@ _DEFAULT: Any = None  # stands for leaves that depend on the robot
 class RMPVICES(ImpedanceController):
     r"""Variable-impedance control as the attractor of an RMP-tree (paper, section III).
 
-    One call evaluates the tree at (q, qd), resolves its root in the inertia metric and
-    turns the acceleration into torque:
+    One call evaluates the tree at (q, qd), resolves its root in the inertia metric
+    under the limits of the motors, and turns the acceleration into torque:
 
     $$
-    (M + \epsilon M_q)\, \ddot q = f, \qquad \tau = b + k\, M_q \ddot q .
+    \min_{\ddot q} \tfrac12 \ddot q^T (M + \epsilon M_q)\, \ddot q - f^T \ddot q
+    \quad \text{s.t.} \quad |\tau| \le \tau_{max}, \quad
+    \tau = M_q \ddot q + b .
     $$
 
-    The inertia-weighted regulariser makes the tree without its safety leaves converge
+    While no joint is at its limit this is $(M + \epsilon M_q)\, \ddot q = f$. The
+    inertia-weighted regulariser makes the tree without its safety leaves converge
     to (coupled) operational-space control as $\epsilon \to 0$; the paper's
     Moore-Penrose inverse does not. The controller is a pytree: gains and leaf
     parameters are array leaves that can be traced, vmapped, differentiated and tuned.
@@ -60,10 +65,15 @@ class RMPVICES(ImpedanceController):
     )
     """Weight of the orientation attractor near a joint limit, so that a hand that can
     turn no further still moves on. The lesser of the two weights counts."""
+    contact: ContactResponse | None = struct.field(default_factory=ContactResponse)
+    """What is done with the contacts' torque, where it is given; None: nothing."""
     dither: SetpointDither | None = struct.field(default_factory=SetpointDither)
     """Motion of the set-point that frees a hand at rest beside such an obstacle."""
     regularizer: Float[Constant, ""] | float = 1e-3
     """The root's epsilon: damps accelerations that no leaf determines."""
+    braking_share: Float[Constant, ""] | float | None = 0.7
+    """Share of the motors' torque that the safety leaves count on for braking. The
+    less, the earlier they brake. None: they do not look at the motors."""
 
     def __post_init__(self):
         """Fill in the default leaves, which depend on the robot."""
@@ -90,11 +100,17 @@ class RMPVICES(ImpedanceController):
             qd: Joint velocities, (n,) [rad/s].
             setpoint: Impedance target, from `setpoint`.
             obstacles: Padded obstacle slots.
+            tau_ext: Joint torque of the contacts, (n,) [N m], measured or from a
+                `ContactObserver`; None: not known.
+            tau_last: Torque of the last control step, (n,) [N m]; None: not known. It
+                matters where the robot has a limit of the torques' rate.
 
         Returns:
-            Torque, acceleration, root RMP and diagnostics: `torque_scale` in [0, 1],
-            `clearance` [m], the least distance of a control point to an obstacle, and
-            `orientation_weight` in [0, 1], the relaxed weight of the orientation.
+            Torque, acceleration, root RMP and diagnostics. These are `torque_limit`,
+            and `velocity_limit` if the robot has one (n,), -1 or 1 for a joint at its
+            limit; `clearance` [m], the least distance of a control point to an
+            obstacle; `stop_time` [s], see `torque.stop_time`; and the weights of this
+            state, `attractor_weight` and `orientation_weight`, in [0, 1].
 
         Raises:
             ValueError: An argument has a wrong shape or dtype.
@@ -105,41 +121,112 @@ class RMPVICES(ImpedanceController):
         q, qd = jnp.asarray(q), jnp.asarray(qd)
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
-        branches, clearance, body_clearance = self._avoidance(arm, obstacles)
-        orientation_weight = self._orientation_weight(q, body_clearance)
+        w = self._by_contact(Mq, tau_ext)
+        slowing, stop = self._braking(Mq, bias, qd, tau_ext)
+        branches, around = self._avoidance(slowing, arm, obstacles, w)
+        clearance, body_clearance = _nearest(around, arm.p.dtype)
         site = site_state(self.robot, arm)
         if self.dither is not None:
             moved = self.dither(setpoint.time, body_clearance, site.v)
             setpoint = setpoint.replace(p_des=setpoint.p_des + moved)
-        branches += self._impedance(site, setpoint, orientation_weight)
-        if self.leaves.joint_limit is not None:
-            branches.append(self.leaves.joint_limit(q, qd))
-        if self.leaves.posture is not None:
-            branches.append(self.leaves.posture(q, qd, Mq))
+        orientation_weight = self._orientation_weight(q, body_clearance)
+        attractor_weight = jnp.ones_like(clearance)
+        turning = jnp.zeros(3, arm.p.dtype)
+        if self.contact is not None and w is not None:
+            attractor_weight = self.contact.attractor_weight(around.pressed)
+            turning = turning_by_contact(site, Mq, w)
+        branches += self._impedance(
+            site, setpoint, attractor_weight, orientation_weight, turning
+        )
+        if slowing.joint_limit is not None:
+            leaf = slowing.joint_limit
+            branches.append(leaf(q, qd) if w is None else leaf.against(q, qd, w))
+        if slowing.posture is not None:
+            branches.append(slowing.posture(q, qd, Mq))
         root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
-        qdd = resolve(root, self.regularizer * Mq)
-        dynamic = jnp.matmul(Mq, qdd, precision="highest")
-        low, high = torque_range(self.robot, tau_last, self.period)
-        tau, limit = clip_torque(dynamic + bias, low, high)
+        solution = self.resolve(root, Mq, bias, qd, w, tau_last)
         return ControlOutput(
-            tau=tau,
-            qdd=qdd,
+            tau=solution.tau,
+            qdd=solution.qdd,
             f=root.f,
             M=root.M,
             Mq=Mq,
             bias=bias,
-            diagnostics={
-                "torque_limit": limit,
+            diagnostics=solution.limits
+            | {
                 "clearance": clearance,
+                "stop_time": stop,
+                "attractor_weight": attractor_weight,
                 "orientation_weight": orientation_weight,
             },
         )
 
+    def resolve(
+        self,
+        root: RMP,
+        Mq: Float[Array, "n n"],
+        bias: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        w: Float[Array, " n"] | None = None,
+        tau_last: Float[ArrayLike, " n"] | None = None,
+    ) -> RootSolution:
+        """Torque from the root RMP, under the limits of the motors.
+
+        Args:
+            root: The root.
+            Mq: Inertia, (n, n) [kg m^2].
+            bias: Coriolis and gravity torques, (n,) [N m].
+            qd: Joint velocities, (n,) [rad/s].
+            w: Joint acceleration by contacts, (n,) [rad/s^2].
+            tau_last: Torque of the last control step, (n,) [N m].
+        """
+        H = root.M + self.regularizer * Mq
+        low, high = torque_range(self.robot, tau_last, self.period)
+        limits = {"torque_limit": Rows.hard(Mq, low - bias, high - bias)}
+        if self.robot.qd_max is not None:
+            qdd_range = speed_range(self.robot.qd_max, qd, w, self.period)
+            limits["velocity_limit"] = Rows.soft(jnp.eye(self.robot.n), *qdd_range)
+        qdd, at_end = solve_root(H, root.f, Rows.join(limits.values()))
+        found = dict(zip(limits, jnp.split(at_end, len(limits)), strict=True))
+        tau = jnp.matmul(Mq, qdd, precision="highest") + bias
+        held = found["torque_limit"]
+        tau = jnp.where(held > 0.0, high, jnp.where(held < 0.0, low, tau))
+        tau, found["torque_limit"] = clip_torque(tau, low, high)
+        return RootSolution(qdd, tau, found)
+
+    def _by_contact(
+        self, Mq: Float[Array, "n n"], tau_ext: Float[ArrayLike, " n"] | None
+    ) -> Float[Array, " n"] | None:
+        """Joint acceleration by the contacts, if it is known and counts."""
+        if self.contact is None or tau_ext is None:
+            return None
+        return self.contact.acceleration(Mq, jnp.asarray(tau_ext))
+
+    def _braking(
+        self,
+        Mq: Float[Array, "n n"],
+        bias: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        tau_ext: Float[ArrayLike, " n"] | None,
+    ) -> tuple[Leaves, Float[Array, ""]]:
+        """The leaves for an arm that needs some time to stop, and that time [s]."""
+        if self.braking_share is None:
+            return self.leaves, jnp.zeros((), Mq.dtype)
+        load = bias if tau_ext is None or self.contact is None else bias - tau_ext
+        tau_max = jnp.asarray(self.robot.tau_max)
+        time = stop_time(Mq, load, qd, tau_max, self.braking_share)
+        return self.leaves.braking(time), time
+
     def _impedance(
-        self, site: SiteState, setpoint: Setpoint, orientation_weight: Float[Array, ""]
+        self,
+        site: SiteState,
+        setpoint: Setpoint,
+        attractor_weight: Float[Array, ""],
+        orientation_weight: Float[Array, ""],
+        turning: Float[Array, " 3"],
     ) -> list[RMP]:
         """The two attractors of the end effector, pulled back to the joints."""
-        weight = self.attractor_weight
+        weight = self.attractor_weight * attractor_weight
         position = PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight)
         orientation = orientation_attractor(
             site.R,
@@ -147,6 +234,7 @@ class RMPVICES(ImpedanceController):
             setpoint.R_des,
             setpoint.kp_ori,
             weight=weight * orientation_weight,
+            feedforward=-turning,
         )
         return [
             pullback(position(site.p, site.v), site.J_pos, site.Jdot_qd_pos),
@@ -154,27 +242,23 @@ class RMPVICES(ImpedanceController):
         ]
 
     def _avoidance(
-        self, arm: ArmState, obstacles: Obstacles
-    ) -> tuple[list[RMP], Float[Array, ""], Float[Array, ""]]:
-        """Collision RMPs on the joints, the least clearance, and that without planes.
-
-        Clearances are in m, and infinite if there is no obstacle.
-        """
-        branches, nearest = [], {}
-        if self.leaves.collision is not None:
-            rmp, nearest = obstacle_branch(
-                self.robot, arm, obstacles, self.leaves.collision
+        self,
+        leaves: Leaves,
+        arm: ArmState,
+        obstacles: Obstacles,
+        w: Float[Array, " n"] | None,
+    ) -> tuple[list[RMP], Surroundings]:
+        """Collision RMPs on the joints, and what is about."""
+        branches, around = [], Surroundings({}, jnp.zeros((), arm.p.dtype))
+        if leaves.collision is not None:
+            near = 0.0 if self.contact is None else self.contact.near
+            rmp, around = obstacle_branch(
+                self.robot, arm, obstacles, leaves.collision, w, near
             )
             branches.append(rmp)
-        if self.leaves.self_collision is not None:
-            branches.append(self_branch(self.robot, arm, self.leaves.self_collision))
-        infinite = jnp.array(jnp.inf, arm.p.dtype)
-        bodies = [d for kind, d in nearest.items() if kind != "planes"]
-        clearance, body_clearance = (
-            functools.reduce(jnp.minimum, distances, infinite)
-            for distances in (nearest.values(), bodies)
-        )
-        return branches, clearance, body_clearance
+        if leaves.self_collision is not None:
+            branches.append(self_branch(self.robot, arm, leaves.self_collision, w))
+        return branches, around
 
     def _orientation_weight(
         self, q: Float[Array, " n"], body_clearance: Float[Array, ""]
@@ -187,3 +271,27 @@ class RMPVICES(ImpedanceController):
             room = jnp.minimum(q - self.robot.q_lower, self.robot.q_upper - q)
             weight = jnp.minimum(weight, self.limit_relaxation(jnp.min(room)))
         return weight
+
+
+class RootSolution(NamedTuple):
+    """What the root asks of the motors."""
+
+    qdd: Float[Array, " n"]
+    """Joint acceleration while nothing touches [rad/s^2]."""
+    tau: Float[Array, " n"]
+    """Torque within the limits [N m]."""
+    limits: dict[str, Float[Array, " n"]]
+    """By name of a limit: -1 or 1 for a joint at its lower or upper end, else 0."""
+
+
+def _nearest(
+    around: Surroundings, dtype: Any
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Least clearance, and that without planes [m]; infinite without obstacles."""
+    infinite = jnp.array(jnp.inf, dtype)
+    bodies = [d for kind, d in around.clearance.items() if kind != "planes"]
+    clearance, body_clearance = (
+        functools.reduce(jnp.minimum, distances, infinite)
+        for distances in (around.clearance.values(), bodies)
+    )
+    return clearance, body_clearance

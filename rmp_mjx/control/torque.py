@@ -32,6 +32,64 @@ def torque_range(
     return jnp.maximum(last - step, -high), jnp.minimum(last + step, high)
 
 
+def stop_time(
+    Mq: Float[Array, "n n"],
+    load: Float[Array, " n"],
+    qd: Float[Array, " n"],
+    tau_max: Float[Constant, " n"],
+    share: Float[Constant, ""] | float = 1.0,
+) -> Float[Array, ""]:
+    r"""Time in which the motors can bring all joints to rest together.
+
+    With $\ddot q = -\dot q / T$, the joints come to rest in a straight line, after
+    $\tfrac12 \dot q T$. Joint i has room for it if $|M_q \dot q|_i / T$ fits between
+    the load and the torque limit on that side. T is the least time for which all do.
+
+    Args:
+        Mq: Inertia, (n, n).
+        load: What the motors hold already: bias minus external torque, (n,) [N m].
+        qd: Joint velocities, (n,) [rad/s].
+        tau_max: Torque limits, (n,) [N m].
+        share: Share of the torque that braking may count on. A joint that its load has
+            pushed to the limit counts with a twentieth of it.
+
+    Returns:
+        The time [s].
+    """
+    momentum = jnp.matmul(Mq, qd, precision="highest")
+    room = tau_max + jnp.sign(momentum) * load
+    room = share * jnp.maximum(room, 0.05 * tau_max)
+    return jnp.max(jnp.abs(momentum) / room, initial=0.0)
+
+
+HORIZON = 5
+"""Periods in which a joint may come to its greatest speed."""
+
+
+def speed_range(
+    qd_max: Float[Constant, " n"],
+    qd: Float[Array, " n"],
+    w: Float[Array, " n"] | None,
+    period: Float[Constant, ""] | float,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """The accelerations that keep the joints within their speeds.
+
+    Args:
+        qd_max: Greatest speeds, (n,) [rad/s].
+        qd: Joint velocities, (n,) [rad/s].
+        w: Joint acceleration by contacts, (n,) [rad/s^2]; None: nothing touches.
+        period: Control period [s]. The rest of the way to the greatest speed takes
+            `HORIZON` of them.
+
+    Returns:
+        Lowest and highest acceleration, (n,) each [rad/s^2].
+    """
+    limit = jnp.asarray(qd_max, qd.dtype)
+    other = jnp.zeros_like(qd) if w is None else w
+    time = HORIZON * period
+    return (-limit - qd) / time - other, (limit - qd) / time - other
+
+
 def clip_torque(
     tau: Float[Array, " n"], low: Float[Array, " n"], high: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -32,23 +32,30 @@ def rmp_vices_tree(
     Mq: Float[Array, "n n"],
     attractor_weight: Float[Constant, ""] | float,
     orientation_weight: Float[Constant, ""] | float,
+    turning_by_contact: Float[Constant, " 3"] | float = 0.0,
 ) -> Node:
     """The controller's tree with the joints at its root (the paper's figure 2).
 
     Args:
         robot: The arm.
-        leaves: All leaves but the attractors.
+        leaves: All leaves but the attractors, with the time to stop in this state.
         setpoint: Impedance target, the dither included.
         obstacles: Obstacle slots.
         Mq: Inertia, the metric of the posture leaf.
         attractor_weight: Metric of the two attractors.
         orientation_weight: Further weight of the orientation attractor, in this state.
+        turning_by_contact: Angular acceleration that it asks back, (3,) [rad/s^2].
     """
     turning = attractor_weight * orientation_weight
     position = PositionAttractor(
         setpoint.p_des, setpoint.kp_pos, weight=attractor_weight
     )
-    orientation = OrientationAttractor(setpoint.R_des, setpoint.kp_ori, weight=turning)
+    orientation = OrientationAttractor(
+        setpoint.R_des,
+        setpoint.kp_ori,
+        weight=turning,
+        feedforward=-turning_by_contact,
+    )
     children: list[Node | Siblings | Leaf] = [
         Node(TaskMap(lambda q: site_pose(robot, q)[0]), (position,)),
         Node(TaskMap(lambda q: site_pose(robot, q)[1]), (orientation,)),
@@ -87,7 +94,15 @@ class Masked(Leaf):
 
     def __call__(self, x: Float[Array, " m"], xd: Float[Array, " m"]) -> RMP:
         """RMP at a distance and its rate."""
-        rmp = self.leaf(x, xd)
+        return self._where_active(self.leaf(x, xd))
+
+    def against(
+        self, x: Float[Array, " m"], xd: Float[Array, " m"], push: Float[Array, " m"]
+    ) -> RMP:
+        """RMP at a distance and its rate, and its acceleration by contacts."""
+        return self._where_active(self.leaf.against(x, xd, push))
+
+    def _where_active(self, rmp: RMP) -> RMP:
         return RMP(f=rmp.f * self.active, M=rmp.M * self.active[:, None])
 
 

@@ -49,6 +49,14 @@ class ScalarLeaf(Leaf):
     A leaf whose coordinates are no distances overrides `scalar_against`.
     """
 
+    def braking(self, stop_time: Float[Array, ""] | float) -> ScalarLeaf:
+        """The leaf for an arm that needs this time to stop [s].
+
+        A leaf takes no notice, unless it keeps a distance.
+        """
+        del stop_time
+        return self
+
     @abc.abstractmethod
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]

@@ -131,10 +131,15 @@ def arm_state(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> Ar
         Vec.of(p, 0).cross(z).map(lambda turn, slide: jnp.where(hinge, turn, slide), z),
         z.map(lambda turn: jnp.where(hinge, turn, 0.0)),
     )
-    inner = np.triu(np.ones((robot.n, robot.n)))
-    V = Motion.of(_dot((S * qd).stack(), inner))
-    A = Motion.of(_dot((V.rate(S) * qd).stack(), inner))
+    V = motion_of(robot, S, qd)
+    A = motion_of(robot, V.rate(S), qd)
     return ArmState(q=jnp.asarray(q), qd=jnp.asarray(qd), p=p, R=R, S=S, V=V, A=A)
+
+
+def motion_of(robot: Robot, S: Motion, u: Float[Array, " n"]) -> Motion:
+    """Motion of every link from that of the joints: columns k sum S_j u_j, j <= k."""
+    inner = np.triu(np.ones((robot.n, robot.n)))
+    return Motion.of(_dot((S * u).stack(), inner))
 
 
 def joint_forces(S: Motion, W: Float[Array, "6 n"]) -> Float[Array, " n"]:

@@ -42,11 +42,12 @@ def orientation_attractor(
     kp: Param,
     kd: Param | None = None,
     weight: Param = 1.0,
+    feedforward: Param = 0.0,
 ) -> RMP:
     r"""Orientation impedance on the angular velocity: metric I on $\omega$.
 
     $$
-    \alpha = k_p\, e_r(R, R_{des}) - k_d\, \omega.
+    \alpha = k_p\, e_r(R, R_{des}) - k_d\, \omega + \alpha_0.
     $$
 
     Pull it back with the angular Jacobian (world frame) and its bias ``Jdot qd``.
@@ -58,6 +59,7 @@ def orientation_attractor(
         kp: Stiffness about the world axes, (3,) or scalar, [1/s^2].
         kd: Damping, [1/s]; ``2 sqrt(kp)`` if None.
         weight: Scale of the identity metric.
+        feedforward: Further angular acceleration, (3,) or scalar, [rad/s^2].
 
     Returns:
         RMP on the angular velocity; f (3,), M (3, 3).
@@ -66,6 +68,7 @@ def orientation_attractor(
     """
     damping = critical_damping(kp) if kd is None else kd
     alpha = kp * orientation_error(R, R_des) - damping * omega
+    alpha = alpha + feedforward
     return RMP(f=weight * alpha, M=weight * jnp.eye(3, dtype=R.dtype))
 
 
@@ -94,12 +97,16 @@ class OrientationAttractor(Leaf):
     """Damping, [1/s]; ``2 sqrt(kp)`` if None."""
     weight: Param = 1.0
     """Scale of the identity metric on the angular velocity."""
+    feedforward: Param = 0.0
+    """Further angular acceleration, world frame, (3,) or scalar, [rad/s^2]."""
 
     def __call__(self, x: Float[Array, " 9"], xd: Float[Array, " 9"]) -> RMP:
         """RMP on the flattened rotation matrix; f (9,), M (9, 9)."""
         R = x.reshape(3, 3)
         omega = unskew(jnp.matmul(xd.reshape(3, 3), R.T, precision="highest"))
-        rmp = orientation_attractor(R, omega, self.R_des, self.kp, self.kd, self.weight)
+        rmp = orientation_attractor(
+            R, omega, self.R_des, self.kp, self.kd, self.weight, self.feedforward
+        )
         identity = jnp.eye(3, dtype=x.dtype)
         B = jnp.stack(
             [

@@ -13,8 +13,8 @@ class Barrier(ScalarLeaf):
 
     $$
     \begin{split}
-    x &= \max(d - \text{margin}, x_\min), \quad
-    v = \min(\dot d, 0), \quad
+    v &= \min(\dot d, 0), \quad
+    x = \max(d - \text{margin} + \tfrac12 v T, x_\min), \quad
     h = e^{-\max(\dot d, 0) / v_{out}} \\
     m &= h \min\bigl(\mu (1 - x/r)^2 (v^2 + \epsilon) / x^4,\ \text{cap}\bigr) \\
     a &= -\eta v + v^2 / x + k_{out} \max(\text{margin} - d, 0) \\
@@ -26,8 +26,9 @@ class Barrier(ScalarLeaf):
     $v^2 / x^4$. ``eps`` keeps the metric up in a slow approach. ``k_out`` resists a
     constant push. The metric fades over the speed ``v_out`` while the body leaves; if
     it ended at zero speed, a body pushed against the barrier would come closer at
-    every rebound. Explicit integration needs ``eta * dt < 2``. docs/maths.md derives
-    each term.
+    every rebound. T is the time that the motors need to stop the arm: what counts is
+    the gap that would be left then. Explicit integration needs ``eta * dt < 2``.
+    docs/maths.md derives each term.
 
     Source: the collision leaf of Shaw et al., "RMPs for Safe Impedance Control in
     Contact-Rich Manipulation" (2021), signs corrected, with the GDS curvature of
@@ -52,6 +53,12 @@ class Barrier(ScalarLeaf):
     """Outward stiffness inside the margin, [1/s^2]."""
     v_out: Param = 3e-3
     """Release speed: the metric fades over it while the body leaves, [unit/s], > 0."""
+    stop_time: Param = 0.0
+    """Time T to stop [s]; the controllers set it."""
+
+    def braking(self, stop_time: Float[Array, ""] | float) -> Barrier:
+        """The barrier for an arm that needs this time to stop [s]."""
+        return self.replace(stop_time=stop_time)
 
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
@@ -65,7 +72,8 @@ class Barrier(ScalarLeaf):
         Returns:
             Natural force ``f`` and metric ``m``, shaped like ``x``.
         """
-        gap = jnp.maximum(x - self.margin, self.x_min)
+        braking = 0.5 * self.stop_time * jnp.minimum(xd, 0.0)
+        gap = jnp.maximum(x - self.margin + braking, self.x_min)
         active = gap < self.r
         gap = jnp.where(active, gap, 1.0)
         depth = jnp.where(active, jnp.maximum(self.margin - x, 0.0), 0.0)

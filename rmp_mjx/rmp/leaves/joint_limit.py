@@ -31,6 +31,10 @@ class JointLimitBarrier(ScalarLeaf):
     barrier: Barrier = flax.struct.field(default_factory=joint_limit_barrier)
     """The barrier applied to each side; its fields may be scalars or (n,)."""
 
+    def braking(self, stop_time: Float[Array, ""] | float) -> JointLimitBarrier:
+        """The barriers for an arm that needs this time to stop [s]."""
+        return self.replace(barrier=self.barrier.braking(stop_time))
+
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
     ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:

@@ -1,0 +1,265 @@
+"""The root of the tree under the limits of the motors: a box-constrained problem."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rmp_mjx.math import psd_solve
+
+ROUNDS = 16
+"""Most active sets that are tried."""
+
+GIVE = 1e-3
+"""Softness of a soft limit."""
+
+CHUNKS, LEAST = 16, 32
+"""States of a batch that need the pivoting are worked off in this many parts of it, of
+this size at least."""
+
+
+class Rows(NamedTuple):
+    """Linear functions of the acceleration, each with a range: low <= A qdd <= high."""
+
+    A: Float[Array, "m n"]
+    """The rows."""
+    low: Float[Array, " m"]
+    """Lower ends."""
+    high: Float[Array, " m"]
+    """Upper ends."""
+    give: Float[Array, " m"]
+    """Softness: 0 for a hard limit. A row with some gives way where not all can hold,
+    by this share of what its multiplier moves it."""
+
+    @staticmethod
+    def hard(A: Array, low: Array, high: Array) -> Rows:
+        """Limits that always hold, (m, n), (m,), (m,)."""
+        return Rows(A, low, high, jnp.zeros_like(low))
+
+    @staticmethod
+    def soft(A: Array, low: Array, high: Array) -> Rows:
+        """Limits that give way to hard ones."""
+        return Rows(A, low, high, jnp.full_like(low, GIVE))
+
+    @staticmethod
+    def join(several: Iterable[Rows]) -> Rows:
+        """All of them, one after the other."""
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *several)
+
+
+@jax.custom_jvp
+def solve_root(
+    H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    r"""The acceleration that the tree wants, as far as the motors can give it.
+
+    $$
+    \min_{\ddot q} \tfrac12 (\ddot q - H^{-1} f)^T H (\ddot q - H^{-1} f)
+    \quad \text{s.t.} \quad l \le A \ddot q \le u
+    $$
+
+    H is the metric of the root, so that what weighs more keeps its way: attractors and
+    posture give in before a collision leaf does. Scaling or clipping the free solution
+    would take the braking of all joints as soon as one is saturated.
+
+    The dual problem has a multiplier for each row. Block pivoting guesses the set of
+    rows at their ends, solves for the multipliers, and moves all rows over that were
+    on the wrong side. If that does not lower their number twice in a row, only the
+    worst one is moved. It ends at the exact solution, after one to five sets as a rule
+    and `ROUNDS` at most. Nothing is computed where the free solution fits. Derivatives
+    are those of the solution with the rows that are at their ends held there.
+
+    Args:
+        H: Metric of the root, positive definite, (n, n).
+        f: Its force, (n,).
+        rows: The limits.
+
+    Returns:
+        Acceleration (n,) [rad/s^2], and for each row -1 or 1 where it is at its lower
+        or upper end, else 0.
+
+    Source: Judice and Pires, "A block principal pivoting algorithm for large-scale
+    strictly monotone linear complementarity problems" (1994), for two-sided rows.
+    """
+    return _limited(H, f, rows)
+
+
+@jax.custom_batching.custom_vmap
+def _limited(
+    H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """`solve_root` for one state."""
+
+    def pivot(_):
+        return _pivoted(H, f, rows)
+
+    def keep(free):
+        return free, jnp.zeros_like(rows.low)
+
+    free, outside = _free(H, f, rows)
+    return jax.lax.cond(outside, pivot, keep, free)
+
+
+@_limited.def_vmap
+def _limited_batch(axis_size, in_batched, H, f, rows):
+    """`solve_root` for many states: only those that need it go through the pivoting.
+
+    They are gathered, and worked off in chunks.
+    """
+    H, f, rows = jax.tree.map(
+        lambda x, own: x if own else jnp.broadcast_to(x, (axis_size, *x.shape)),
+        (H, f, rows),
+        tuple(in_batched),
+    )
+    free, outside = jax.vmap(_free)(H, f, rows)
+    count = jnp.sum(outside)
+    place = jnp.where(outside, jnp.cumsum(outside) - 1, axis_size)
+    chunk = max(axis_size // CHUNKS, min(axis_size, LEAST))
+    order = jnp.full(axis_size + chunk, axis_size)
+    order = order.at[place].set(jnp.arange(axis_size), mode="drop")
+
+    def goes_on(state):
+        return state[0] < count
+
+    def solve(state):
+        begin, qdd, at_end = state
+        lanes = jax.lax.dynamic_slice(order, (begin,), (chunk,))
+        those = jax.tree.map(lambda x: x.at[lanes].get(mode="clip"), (H, f, rows))
+        new, ends = jax.vmap(_pivoted)(*those)
+        qdd = qdd.at[lanes].set(new, mode="drop")
+        return begin + chunk, qdd, at_end.at[lanes].set(ends, mode="drop")
+
+    start = (jnp.zeros((), count.dtype), free, jnp.zeros_like(rows.low))
+    _, qdd, at_end = jax.lax.while_loop(goes_on, solve, start)
+    return (qdd, at_end), (True, True)
+
+
+def _free(
+    H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """The unconstrained solution, and whether it breaks a limit."""
+    qdd = psd_solve(H, f)
+    t = jnp.matmul(rows.A, qdd, precision="highest")
+    return qdd, jnp.any((t > rows.high) | (t < rows.low))
+
+
+def _pivoted(
+    H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """`solve_root` without a look at whether the free solution fits."""
+    dual = _dual(H, f, rows)
+    at_end = _pivot(dual)
+    return _held(dual, at_end), at_end
+
+
+class Dual(NamedTuple):
+    """The problem in the multipliers of the rows, scaled to a unit diagonal."""
+
+    free: Float[Array, " n"]
+    """The unconstrained solution."""
+    lift: Float[Array, "n m"]
+    """What a unit multiplier of each (scaled) row takes from the solution."""
+    W: Float[Array, "m m"]
+    """What it takes from each (scaled) row."""
+    t: Float[Array, " m"]
+    """The rows at the unconstrained solution."""
+    low: Float[Array, " m"]
+    """Lower ends."""
+    high: Float[Array, " m"]
+    """Upper ends."""
+    give: Float[Array, " m"]
+    """Softness."""
+
+
+def _dual(H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows) -> Dual:
+    dot = functools.partial(jnp.matmul, precision="highest")
+    X = psd_solve(H, jnp.concatenate([f[:, None], rows.A.T], axis=1))
+    free, lift = X[:, 0], X[:, 1:]
+    W = dot(rows.A, lift)
+    s = jax.lax.rsqrt(jnp.maximum(jnp.diagonal(W), jnp.finfo(W.dtype).tiny))
+    return Dual(
+        free,
+        lift * s[None],
+        W * s[:, None] * s[None],
+        dot(rows.A, free) * s,
+        rows.low * s,
+        rows.high * s,
+        rows.give,
+    )
+
+
+def _multipliers(
+    dual: Dual, at_end: Float[Array, " m"]
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Multipliers that hold these rows at their ends, and where all rows then are."""
+    held = at_end != 0.0
+    end = jnp.where(at_end > 0.0, dual.high, dual.low)
+    both = held[:, None] & held[None]
+    own = jnp.diag(jnp.where(held, dual.give, 1.0))
+    over = jnp.where(held, dual.t - jnp.where(held, end, 0.0), 0.0)
+    lam = psd_solve(jnp.where(both, dual.W, 0.0) + own, over)
+    return lam, dual.t - jnp.matmul(dual.W, lam, precision="highest")
+
+
+def _pivot(dual: Dual) -> Float[Array, " m"]:
+    """The rows at their ends in the solution."""
+    tiny = 8.0 * jnp.finfo(dual.t.dtype).eps
+    slack = tiny * (jnp.abs(dual.low) + jnp.abs(dual.high))
+
+    def judge(at_end):
+        """Where each row belongs, given the others, and how wrong it is now."""
+        lam, t = _multipliers(dual, at_end)
+        over = (t > dual.high + slack).astype(t.dtype)
+        under = (t < dual.low - slack).astype(t.dtype)
+        free = at_end == 0.0
+        leaves = lam * at_end < 0.0
+        belongs = jnp.where(free, over - under, jnp.where(leaves, 0.0, at_end))
+        beyond = jnp.maximum(t - dual.high, dual.low - t)
+        wrong = jnp.where(free, beyond, -lam * at_end)
+        return belongs, jnp.where(belongs == at_end, -jnp.inf, wrong)
+
+    def goes_on(state):
+        at_end, belongs, _, _, _, count = state
+        return jnp.any(at_end != belongs) & (count < ROUNDS)
+
+    def move(state):
+        at_end, belongs, wrong, fewest, patience, count = state
+        number = jnp.sum(at_end != belongs)
+        fewer = number < fewest
+        all_at_once = fewer | (patience > 0)
+        worst = jnp.arange(len(wrong)) == jnp.argmax(wrong)
+        at_end = jnp.where(all_at_once | worst, belongs, at_end)
+        patience = jnp.where(fewer, 1, jnp.maximum(patience - 1, 0))
+        return (
+            at_end,
+            *judge(at_end),
+            jnp.minimum(fewest, number),
+            patience,
+            count + 1,
+        )
+
+    none = jnp.zeros_like(dual.t)
+    start = (none, *judge(none), jnp.array(len(none) + 1), jnp.array(1), jnp.array(0))
+    return jax.lax.while_loop(goes_on, move, start)[0]
+
+
+def _held(dual: Dual, at_end: Float[Array, " m"]) -> Float[Array, " n"]:
+    """The solution with these rows held at their ends, (n,)."""
+    lam, _ = _multipliers(dual, at_end)
+    return dual.free - jnp.matmul(dual.lift, lam, precision="highest")
+
+
+@solve_root.defjvp
+def _derivative(primals, tangents):
+    qdd, at_end = solve_root(*primals)
+
+    def held(H, f, rows):
+        return _held(_dual(H, f, rows), at_end)
+
+    _, change = jax.jvp(held, primals, tangents)
+    return (qdd, at_end), (change, jnp.zeros_like(at_end))
