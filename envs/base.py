@@ -27,9 +27,10 @@ class ArmEnv(World[OptionsT]):
 
     `reset` and `step` are pure functions of one environment; callers vmap them. What
     differs between tasks is in `envs.task.Task`. `State.info` holds the random key
-    (`rng`), the policy steps so far (`step`), the spheres (`spheres`), the events that
-    are still going on (`active_events`), and the task's own part (`task`); keys that
-    a wrapper adds pass through.
+    (`rng`), the policy steps so far (`step`), the spheres (`spheres`), what the
+    controller remembers (`control`, see `ControlMemory`), the events that are still
+    going on (`active_events`), and the task's own part (`task`); keys that a wrapper
+    adds pass through.
     """
 
     dt = CTRL_DT
@@ -69,6 +70,7 @@ class ArmEnv(World[OptionsT]):
                 "rng": rng,
                 "step": jnp.zeros((), jnp.int32),
                 "spheres": spheres,
+                "control": self.remember(q),
                 "active_events": SafetyRecord.empty().events,
                 "task": task,
             },
@@ -79,8 +81,14 @@ class ArmEnv(World[OptionsT]):
         options, info = self.options, state.info
         rng, key = jax.random.split(info["rng"])
         error = options.obstacle_noise * jax.random.normal(key, (self.scene.spheres, 3))
-        data, spheres, setpoint, record = self.drive(
-            state.data, info["spheres"], action, error, self.dt * info["step"]
+        data, spheres, control, setpoint, record = self.drive(
+            state.data,
+            info["spheres"],
+            action,
+            info["control"],
+            error,
+            self.dt * info["step"],
+            jax.random.fold_in(key, 1),
         )
         step = info["step"] + 1
         site = self.site(data)
@@ -118,6 +126,7 @@ class ArmEnv(World[OptionsT]):
                 "rng": rng,
                 "step": step,
                 "spheres": spheres,
+                "control": control,
                 "active_events": record.events,
                 "task": score.task,
             },

@@ -32,6 +32,9 @@ _AT_LEAST_ZERO = (
     "obstacle_speed",
     "obstacle_noise",
     "obstacle_delay",
+    "observer_noise",
+    "observer_delay",
+    "observer_dead_band",
     "start_noise",
 )
 
@@ -72,6 +75,18 @@ class Options:
     anew at every policy step [m]."""
     obstacle_delay: float = 0.0
     """Delay of the sphere positions that the controller sees [s]."""
+    observer: Literal["none", "momentum", "exact"] = "none"
+    """What tells the controller the contacts' joint torque: nothing, a momentum
+    observer, or its one-step form, which is exact in simulation and one step late."""
+    observer_gain: float = 100.0
+    """Bandwidth of the momentum observer [1/s]."""
+    observer_noise: float = 0.0
+    """Standard deviation of the joint velocities that the observer gets, drawn anew at
+    every control step [rad/s]."""
+    observer_delay: float = 0.0
+    """Delay of the observer's torque [s]; a multiple of `sim_dt`."""
+    observer_dead_band: float = 0.0
+    """Torque of a joint that the observer counts as none [N m]."""
     event_penalty: float = 50.0
     """Cost of a collision or joint-limit event."""
     terminate_on_event: bool = True
@@ -99,6 +114,15 @@ class Options:
                 raise ValueError(
                     f"{name} must be at least 0, got {getattr(self, name)}"
                 )
+        if not self.observer_gain > 0:
+            raise ValueError(
+                f"observer_gain must be positive, got {self.observer_gain}"
+            )
+        if abs(self.observer_steps * self.sim_dt - self.observer_delay) > 1e-9:
+            raise ValueError(
+                f"observer_delay={self.observer_delay} s is no multiple of the control "
+                f"step of {self.sim_dt} s"
+            )
         if self.episode_length < 1:
             raise ValueError(
                 f"episode_length must be at least 1, got {self.episode_length}"
@@ -124,6 +148,11 @@ class Options:
             if (value := getattr(self, f"obstacle_{name}"))
         ]
         return f"{self.obstacles} spheres ({self.layout}{''.join(extra)})"
+
+    @property
+    def observer_steps(self) -> int:
+        """Control steps of `observer_delay`."""
+        return round(self.observer_delay / self.sim_dt)
 
     def record(self) -> dict[str, Any]:
         """The options by name, `env` first, JSON-ready."""

@@ -69,7 +69,7 @@ def policy_step(
         The start, the set-point, the parts of every physics step, and the result.
     """
     options, n, info = env.options, env.robot.n, state.info
-    data, spheres = state.data, info["spheres"]
+    data, spheres, memory = state.data, info["spheres"], info["control"]
     yield Moment("before", {"action": np.asarray(action), **_motion(data)})
 
     ctrl = env.controller
@@ -80,20 +80,21 @@ def policy_step(
 
     _, key = jax.random.split(info["rng"])
     error = options.obstacle_noise * jax.random.normal(key, (env.scene.spheres, 3))
+    noise = env.noise(jax.random.fold_in(key, 1))
 
     @jax.jit
-    def control(data, spheres):
-        seen = env.obstacles(data, spheres, error)
-        out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, seen)
+    def control(data, spheres, memory, noise):
+        out, memory = env.control(data, spheres, setpoint, memory, error, noise)
         centers = data.mocap_pos
         if options.obstacle_speed and env.scene.spheres:
             centers, spheres = spheres.move(centers, env.sim_dt, *env.sphere_box)
-        return out, centers, spheres
+        return out, centers, spheres, memory
 
     model, simulated = env.scene.model, mujoco.MjData(env.scene.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     for k in range(env.n_substeps):
-        out, centers, spheres = control(data, spheres)
+        wrong = None if noise is None else noise[k]
+        out, centers, spheres, memory = control(data, spheres, memory, wrong)
         parts = {
             "root force": np.asarray(out.f),
             "root metric": np.asarray(out.M),

@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from envs import safety
+from rmp_mjx.control.observer import ContactMemory
 from rmp_mjx.metric import SUCCESS, Metric, of_fields
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.sim import PhysicsState
@@ -34,6 +35,16 @@ ARM_ENTRIES = (
     Entry("angular_velocity", 3, "rad/s", "its angular velocity"),
 )
 """What every observation begins with."""
+
+
+class ControlMemory(Pytree):
+    """What the controller is told of the control steps before this one."""
+
+    contact: ContactMemory | None
+    """Memory of the observer of contact torque; None without one."""
+    tau: Float[Array, " n"] | None
+    """Torque of the last control step [N m]; None for an arm without a limit on its
+    rate."""
 
 
 class State(Pytree):

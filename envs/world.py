@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +17,13 @@ from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, build_scene
 from envs.spheres import Spheres
 from envs.task import OptionsT, Task
+from envs.types import ControlMemory
 from rmp_mjx import sim
 from rmp_mjx.control import RMPVICES, Controller, Leaves
+from rmp_mjx.control.observer import ContactObserver
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
+from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import (
     SiteState,
     arm_state,
@@ -27,7 +32,7 @@ from rmp_mjx.robot.kinematics import (
 )
 from rmp_mjx.shapes import Gap
 from rmp_mjx.sim import PhysicsState
-from rmp_mjx.types import Setpoint
+from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.vec import Vec
 
 
@@ -46,6 +51,9 @@ class World(Task[OptionsT]):
             options: The task's options.
             robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
             controller: A controller object instead of the options' named one.
+
+        Raises:
+            ValueError: There is an observer, and the controller takes no `tau_ext`.
         """
         self.options = options
         self._own = {"arm": robot is not None, "controller": controller is not None}
@@ -62,6 +70,7 @@ class World(Task[OptionsT]):
         self.physics = sim.load_physics(options.physics, self.scene.model)
         self.sim_dt = options.sim_dt
         self.n_substeps = substeps(options.sim_dt)
+        self.observer = self._named_observer()
 
     def _jaco(self) -> Robot:
         """The Jaco 2; its posture leaf rests where the task starts."""
@@ -71,11 +80,27 @@ class World(Task[OptionsT]):
     def _named_controller(self) -> Controller:
         """The options' controller; the task's leaves take the place of default ones."""
         controller = CONTROLLERS[self.options.controller](self.robot)
+        controller = controller.replace(period=self.options.sim_dt)
         collision = self.collision_leaves(self.robot)
         if collision and isinstance(controller, RMPVICES):
             default = controller.leaves == Leaves.default(self.robot)
             return controller.with_collision(collision) if default else controller
         return controller
+
+    def _named_observer(self) -> ContactObserver | None:
+        """The options' observer of contact torque."""
+        options = self.options
+        if options.observer == "none":
+            return None
+        if not _takes(self.controller, "tau_ext"):
+            raise ValueError(
+                f"observer={options.observer} gives the controller tau_ext=, which "
+                f"'{type(self.controller).__name__}' does not take: add the argument "
+                "to its __call__, or choose observer=none"
+            )
+        gain = options.observer_gain if options.observer == "momentum" else None
+        band, delay = options.observer_dead_band, options.observer_steps
+        return ContactObserver.of(self.robot, gain, band, delay)
 
     @property
     def identity(self) -> dict[str, str]:
@@ -116,34 +141,93 @@ class World(Task[OptionsT]):
         radius, delay = self.options.sphere_radius, self.options.obstacle_delay
         return spheres.perceive(slots, data.mocap_pos, radius, error, delay)
 
+    def remember(self, q: Float[Array, " n"]) -> ControlMemory:
+        """What is known of the control before an episode: the arm is held at rest.
+
+        Args:
+            q: Joint positions, (n,) [rad].
+        """
+        contact = None if self.observer is None else self.observer.start(self.robot.n)
+        if self.robot.tau_rate_max is None:
+            return ControlMemory(contact, None)
+        arm = arm_state(self.robot, q, jnp.zeros_like(q))
+        return ControlMemory(contact, self._applied(dynamics(self.robot, arm)[1]))
+
+    def control(
+        self,
+        data: PhysicsState,
+        spheres: Spheres,
+        setpoint: Any,
+        memory: ControlMemory,
+        error: Array | float = 0.0,
+        noise: Array | None = None,
+    ) -> tuple[ControlOutput, ControlMemory]:
+        """One control step: the controller, with what an arm can measure of contacts.
+
+        Args:
+            data: Physics.
+            spheres: The spheres.
+            setpoint: Target, from the controller's `setpoint`.
+            memory: From `remember`, or from the last control step.
+            error: Error of the spheres' measured positions, (k, 3) [m].
+            noise: Error of the joint velocities that the observer gets, (n,) [rad/s];
+                None: no error.
+
+        Returns:
+            The controller's output, and the memory for the next step.
+        """
+        n, felt, contact = self.robot.n, {}, memory.contact
+        q, qd = data.qpos[:n], data.qvel[:n]
+        if self.observer is not None and contact is not None:
+            measured = qd if noise is None else qd + noise
+            felt["tau_ext"], contact = self.observer.estimate(
+                contact, measured, self.sim_dt
+            )
+        if memory.tau is not None and _takes(self.controller, "tau_last"):
+            felt["tau_last"] = memory.tau
+        seen = self.obstacles(data, spheres, error)
+        out = self.controller(q, qd, setpoint, seen, **felt)
+        tau = self._applied(out.tau)
+        if contact is not None:
+            contact = contact.then(out.Mq, out.bias, tau)
+        return out, ControlMemory(contact, None if memory.tau is None else tau)
+
+    def _applied(self, tau: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Torques as the motors give them, within their ranges [N m]."""
+        low, high = self.scene.model.actuator_ctrlrange[: self.robot.n].T
+        return jnp.clip(tau, jnp.asarray(low, tau.dtype), jnp.asarray(high, tau.dtype))
+
     def drive(
         self,
         data: PhysicsState,
         spheres: Spheres,
         action: Float[Array, " 12"],
+        memory: ControlMemory,
         error: Array | float = 0.0,
         time: Array | float = 0.0,
-    ) -> tuple[PhysicsState, Spheres, Setpoint, SafetyRecord]:
+        key: Array | None = None,
+    ) -> tuple[PhysicsState, Spheres, ControlMemory, Setpoint, SafetyRecord]:
         """Hold one action for a policy step; the controller runs every physics step.
 
         Args:
             data: Physics.
             spheres: The spheres.
             action: Action in [-1, 1].
+            memory: From `remember`, or from the last policy step.
             error: Error of the spheres' measured positions, (k, 3) [m].
             time: Time of the policy step [s].
+            key: Randomness of what the observer measures; None: no noise.
 
         Returns:
-            Physics and spheres afterwards, the set-point that was held, and what
-            happened.
+            Physics, spheres and memory afterwards, the set-point that was held, and
+            what happened.
         """
         ctrl, n = self.controller, self.robot.n
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action), time)
 
-        def substep(carry, _):
-            data, spheres, torques, motion, record = carry
-            seen = self.obstacles(data, spheres, error)
-            out = ctrl(data.qpos[:n], data.qvel[:n], setpoint, seen)
+        def substep(carry, noise):
+            data, spheres, memory, torques, motion, record = carry
+            out, memory = self.control(data, spheres, setpoint, memory, error, noise)
             if self.options.obstacle_speed and self.scene.spheres:
                 centers, spheres = spheres.move(
                     data.mocap_pos, self.sim_dt, *self.sphere_box
@@ -159,14 +243,21 @@ class World(Task[OptionsT]):
                 out.diagnostics["torque_limit"],
             )
             record = record.then(now, 1.0 / self.n_substeps)
-            return (data, spheres, torques, motion, record), None
+            return (data, spheres, memory, torques, motion, record), None
 
         before = Torques.start(n), Motion.start(data.qvel[:n])
-        start = (data, spheres, *before, SafetyRecord.empty())
-        (data, spheres, _, _, record), _ = jax.lax.scan(
-            substep, start, None, length=self.n_substeps
+        start = (data, spheres, memory, *before, SafetyRecord.empty())
+        (data, spheres, memory, _, _, record), _ = jax.lax.scan(
+            substep, start, self.noise(key), length=self.n_substeps
         )
-        return data, spheres, setpoint, record
+        return data, spheres, memory, setpoint, record
+
+    def noise(self, key: Array | None) -> Array | None:
+        """Errors of the observer's velocities in a policy step, (steps, n) [rad/s]."""
+        if key is None or self.observer is None:
+            return None
+        drawn = jax.random.normal(key, (self.n_substeps, self.robot.n))
+        return self.options.observer_noise * drawn
 
     def site(self, data: PhysicsState) -> SiteState:
         """Pose and velocity of the grip site."""
@@ -190,3 +281,9 @@ class World(Task[OptionsT]):
             for gap in self.gaps(data, spheres)
         )
         return functools.reduce(jnp.minimum, nearest)
+
+
+def _takes(controller: Controller, name: str) -> bool:
+    """Whether the controller can be given an argument of this name."""
+    parameters = inspect.signature(controller).parameters.values()
+    return any(p.name == name or p.kind == p.VAR_KEYWORD for p in parameters)

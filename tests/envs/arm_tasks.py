@@ -11,6 +11,9 @@ import numpy as np
 import envs
 from envs.options import Options
 from rmp_mjx.pytree import Pytree
+from rmp_mjx.robot import Robot
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.types import ControlOutput, Setpoint
 from tests.training import toys
 
@@ -21,6 +24,10 @@ class Torques(Pytree):
     """A controller that compiles fast: the action is a torque on top of `hold`."""
 
     hold: jax.Array | np.ndarray
+    lean: float = 0.0
+    """Share of the contacts' torque that it adds."""
+    robot: Robot | None = None
+    """The arm whose dynamics it reports; None: those of none."""
 
     def decode(self, action):
         return action
@@ -31,13 +38,18 @@ class Torques(Pytree):
     def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
         push = jnp.concatenate([setpoint.kp_pos, setpoint.kp_ori, jnp.zeros(1)])
         tau = jnp.asarray(self.hold) + push
+        Mq, bias = jnp.eye(7), jnp.zeros(7)
+        if self.robot is not None:
+            Mq, bias = dynamics(self.robot, arm_state(self.robot, q, qd))
+        if tau_ext is not None:
+            tau = tau + self.lean * tau_ext
         return ControlOutput(
             tau=tau,
             qdd=tau,
             f=tau,
             M=jnp.eye(7),
-            Mq=jnp.eye(7),
-            bias=jnp.zeros(7),
+            Mq=Mq,
+            bias=bias,
             diagnostics={"torque_limit": jnp.where(push[5] > 0.0, jnp.eye(7)[0], 0.0)},
         )
 

@@ -26,6 +26,8 @@ def make():
             data.qpos[:] = robot.q_home
             mujoco.mj_forward(robot.mj_model, data)
             controller = Torques(np.asarray(data.qfrc_bias, np.float32))
+            if "observer" in options:
+                controller = controller.replace(robot=robot)
         options = {"physics": "mujoco", "obstacles": 2} | options
         env = envs.load(task, controller=controller, **options)
         return SimpleNamespace(

@@ -28,10 +28,11 @@ def task(request):
 
 @pytest.fixture(scope="module", params=envs.names())
 def limp(request):
-    """Each task with a controller that compiles fast."""
+    """Each task with a controller that compiles fast, and with an observer."""
     controller = Torques(jnp.zeros(7))
+    options = {"observer": "momentum", "observer_noise": 0.01, "observer_delay": 0.01}
     return envs.load(
-        request.param, controller=controller, physics="mujoco", obstacles=2
+        request.param, controller=controller, physics="mujoco", obstacles=2, **options
     )
 
 

@@ -1,4 +1,6 @@
-"""Both controllers driven into the table, a joint limit and a sphere."""
+"""Both controllers driven into a table, a limit and a sphere, and what they feel."""
+
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.envs.arm_tasks import LANES
+import envs
+from rmp_mjx.pytree import Pytree
+from rmp_mjx.robot.dynamics import dynamics
+from rmp_mjx.robot.kinematics import arm_state
+from tests.envs.arm_tasks import LANES, Torques
 
 STEPS = 60  # 3 s
 TABLE, LIMIT, SPHERE, FREE = 0, 1, 2, 7
@@ -129,9 +135,9 @@ def test_both_engines_step_the_task_alike(make, close, quiet):
     """
     switches = {"terminate_on_event": False, "terminate_on_success": False}
     options = {"observation": "fixed", "layout": "close", "event_penalty": 7.0}
-    mjx = make("torques", physics="mjx", **switches, **options)
+    mjx = make("torques", physics="mjx", observer="exact", **switches, **options)
     action = jnp.zeros((LANES, 12)).at[0, 1].set(-25.0)
-    ours, theirs = quiet, quiet
+    ours, theirs = with_memory(mjx.env, quiet), quiet
     flags = []
     for _ in range(10):
         ours, theirs = mjx.step(ours, action), close.step(theirs, action)
@@ -145,3 +151,129 @@ def test_both_engines_step_the_task_alike(make, close, quiet):
         force = [float(s.metrics[name][0]) for s in (ours, theirs)]
         assert force[1] > 1.0
         assert force[0] == pytest.approx(force[1], rel=rel)
+    felt = np.abs(ours.info["control"].contact.tau_ext).max(axis=1)
+    assert felt[0] > 1.0
+    assert felt[1:].max() < 1e-3
+
+
+@pytest.fixture(scope="module")
+def leaning(far):
+    """`leaning(**options)`: a controller that adds 0.2 of the torque it is told of."""
+
+    def build(**options):
+        controller = far.env.controller.replace(lean=0.2, robot=far.env.robot)
+        options |= {"physics": "mujoco", "obstacles": 2, "terminate_on_event": False}
+        env = envs.load("trajectory", controller=controller, **options)
+        return SimpleNamespace(env=env, step=jax.jit(jax.vmap(env.step)))
+
+    return build
+
+
+def with_memory(env, state):
+    memory = jax.vmap(env.remember)(state.data.qpos)
+    return state.replace(info=state.info | {"control": memory})
+
+
+def test_the_controller_is_told_the_contact_torque_of_the_step_before(
+    leaning, quiet, arm
+):
+    """One lane falls on the table; MuJoCo C in double precision tells as much.
+
+    It starts from our state at every policy step: within 1 % of the lane's own impact.
+    """
+    task = leaning(observer="exact")
+    state = with_memory(task.env, quiet)
+    action = np.zeros((LANES, 12), np.float32)
+    action[0, 1] = -25.0
+    hold = np.asarray(task.env.controller.hold, float)
+    data, peak = arm.data, 0.0
+    felt = told = np.zeros(7)
+    for _ in range(12):
+        before, state = state, task.step(state, jnp.asarray(action))
+        mujoco.mj_resetData(arm.model, data)
+        for name in ("qpos", "qvel", "mocap_pos"):
+            getattr(data, name)[:] = getattr(before.data, name)[0]
+        data.qacc_warmstart[:] = before.data.warmstart[0]
+        for _ in range(task.env.n_substeps):
+            told = felt
+            data.ctrl[:] = hold + 0.2 * told
+            data.ctrl[1] -= 25.0
+            mujoco.mj_step(arm.model, data)
+            felt = data.qfrc_constraint[:7].copy()
+        peak = max(peak, np.abs(told).max())
+        contact = state.info["control"].contact
+        np.testing.assert_allclose(
+            contact.tau_ext[0], told, rtol=0.0, atol=1e-3 + 0.01 * peak
+        )
+        low, high = arm.model.actuator_ctrlrange.T
+        given = np.clip(data.ctrl, low, high)
+        np.testing.assert_allclose(contact.tau[0], given, atol=1e-3 + 0.002 * peak)
+        np.testing.assert_allclose(contact.tau_ext[1:], 0.0, atol=1e-3)
+    assert peak > 10.0
+
+
+def test_an_observer_measures_with_noise_and_delay(leaning, far):
+    """Held at rest: what is left of the noise says its size, 3 % of 7,000 draws."""
+    options = {"observer_noise": 0.01, "observer_delay": 0.015}
+    task = leaning(observer="momentum", observer_gain=50.0, **options)
+    assert task.env.observer.delay == 3
+    state = with_memory(task.env, far.starts)
+    still = jnp.zeros((1000, 12))
+    seen = []
+    for _ in range(2):
+        state = task.step(state, still)
+        contact = state.info["control"].contact
+        assert contact.late.shape == (1000, 3, 7)
+        seen.append(np.asarray(contact.qd - state.data.qvel))
+    for error in seen:
+        assert error.std() == pytest.approx(0.01, rel=0.03)
+    assert abs(np.corrcoef(seen[0].ravel(), seen[1].ravel())[0, 1]) < 0.05
+
+
+class Plain(Pytree):
+    """A user's controller that knows nothing of contact torque."""
+
+    inner: Torques
+
+    def decode(self, action):
+        return action
+
+    def setpoint(self, q, action, time):
+        return self.inner.setpoint(q, action, time)
+
+    def __call__(self, q, qd, setpoint, obstacles):
+        return self.inner(q, qd, setpoint, obstacles)
+
+
+def test_a_controller_that_takes_no_contact_torque_runs_without_an_observer(far):
+    plain = Plain(far.env.controller)
+    env = envs.load("push", controller=plain, physics="mujoco")
+    state = env.reset(jax.random.key(0))
+    assert jax.tree.leaves(state.info["control"]) == []
+    assert np.all(np.isfinite(jax.jit(env.step)(state, jnp.zeros(12)).obs))
+    with pytest.raises(ValueError, match=r"tau_ext=, which 'Plain' does not take"):
+        envs.load("push", controller=plain, observer="momentum")
+
+
+class Frozen(Torques):
+    """Gives the last torque again."""
+
+    def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
+        out = super().__call__(q, qd, setpoint, obstacles, tau_ext)
+        return out.replace(tau=tau_last)
+
+
+def test_an_arm_with_limited_torque_rates_is_told_its_last_torque(far):
+    """Before an episode that is what holds the arm at rest."""
+    robot = far.env.robot.replace(tau_rate_max=np.full(7, 500.0))
+    frozen = Frozen(far.env.controller.hold)
+    env = envs.load("trajectory", controller=frozen, robot=robot, physics="mujoco")
+    state = env.reset(jax.random.key(0))
+    q = state.data.qpos
+    holding = dynamics(robot, arm_state(robot, q, jnp.zeros(7)))[1]
+    np.testing.assert_allclose(state.info["control"].tau, holding, atol=1e-5)
+    step = jax.jit(env.step)
+    for _ in range(3):
+        state = step(state, jnp.zeros(12))
+    np.testing.assert_array_equal(state.info["control"].tau, holding)
+    np.testing.assert_allclose(state.data.qpos, q, atol=1e-4)

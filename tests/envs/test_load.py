@@ -35,6 +35,10 @@ def test_an_unknown_task_lists_the_tasks_and_suggests_one():
         ({"sim_dt": -0.005}, "sim_dt must be in"),
         ({"sim_dt": 0.1}, "sim_dt must be in"),
         ({"sim_dt": float("nan")}, "sim_dt must be in"),
+        ({"observer": "perfect"}, "'perfect'.*none, momentum, exact"),
+        ({"observer_gain": 0.0}, "observer_gain must be positive"),
+        ({"observer_noise": -0.1}, "observer_noise must be at least 0"),
+        ({"observer_delay": 0.007}, "0.007 s is no multiple of the control step"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:Attach conflict")
