@@ -9,6 +9,7 @@ from rmp_mjx.control import Controller as Controller
 from rmp_mjx.control import Leaves as Leaves
 from rmp_mjx.control import OrientationRelaxation as OrientationRelaxation
 from rmp_mjx.control import SetpointDither as SetpointDither
+from rmp_mjx.control import StopGuard as StopGuard
 from rmp_mjx.control import per_link as per_link
 from rmp_mjx.control import rmp_vices_literal as rmp_vices_literal
 from rmp_mjx.obstacles import Obstacles as Obstacles

@@ -5,6 +5,7 @@ from rmp_mjx.control.action import ActionRange as ActionRange
 from rmp_mjx.control.avoidance import per_link as per_link
 from rmp_mjx.control.controller import Controller as Controller
 from rmp_mjx.control.dither import SetpointDither as SetpointDither
+from rmp_mjx.control.guard import StopGuard as StopGuard
 from rmp_mjx.control.leaves import Leaves as Leaves
 from rmp_mjx.control.literal import rmp_vices_literal as rmp_vices_literal
 from rmp_mjx.control.observer import ContactObserver as ContactObserver

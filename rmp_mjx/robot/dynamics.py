@@ -73,6 +73,21 @@ def dynamics(
     return Mq, _hold_passive(robot, arm, joint_forces(S, sums[10:]))
 
 
+def holding_torque(robot: Robot, arm: ArmState) -> Float[Array, " n"]:
+    """Torque that holds the arm at rest against gravity and its springs, (n,) [N m].
+
+    It is the bias at qd = 0.
+    """
+    c, _ = carry_points(robot, arm, robot.com, np.arange(robot.n))
+    mass = jnp.asarray(robot.mass, arm.p.dtype)
+    gravity = Vec.of(jnp.asarray(robot.gravity, arm.p.dtype))
+    force = gravity.map(lambda g: -g * mass)
+    own = jnp.concatenate([force.stack(), c.cross(force).stack()])
+    outward = jnp.asarray(np.tril(np.ones((robot.n, robot.n))), arm.p.dtype)
+    held = joint_forces(arm.S, jnp.matmul(own, outward, precision="highest"))
+    return _hold_passive(robot, arm.replace(qd=jnp.zeros_like(arm.qd)), held)
+
+
 def _hold_passive(robot: Robot, arm: ArmState, bias: Array) -> Array:
     """The bias plus what balances the joints' dampers and springs."""
     dtype = arm.p.dtype
