@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from envs import sight
 from envs.options import CTRL_DT
 from envs.placement import place_spheres
 from envs.safety import SafetyRecord
-from envs.spheres import AWAY, Spheres
+from envs.spheres import AWAY, LEVEL, Course, Spheres, draw_count, draw_speed
 from envs.task import OptionsT
 from envs.types import METRICS, Measures, State
 from envs.world import World
@@ -29,8 +30,8 @@ class ArmEnv(World[OptionsT]):
     differs between tasks is in `envs.task.Task`. `State.info` holds the random key
     (`rng`), the policy steps so far (`step`), the spheres (`spheres`), what the
     controller remembers (`control`, see `ControlMemory`), the events that are still
-    going on (`active_events`), and the task's own part (`task`); keys that a wrapper
-    adds pass through.
+    going on (`active_events`), and the task's own part (`task`); with a curriculum also
+    its stage (`course`). Keys that a wrapper adds pass through.
     """
 
     dt = CTRL_DT
@@ -46,23 +47,43 @@ class ArmEnv(World[OptionsT]):
     @property
     def metrics(self) -> dict[str, Metric]:
         """What `State.metrics` holds, by name."""
-        return by_name([*METRICS.values(), *self.task_metrics])
+        own = (LEVEL,) if self.options.obstacle_curriculum else ()
+        return by_name([*METRICS.values(), *self.task_metrics, *own])
 
     def reset(self, rng: Array) -> State:
-        """Start near the start configuration, everything random drawn anew."""
+        """Start near the start configuration, everything random drawn anew.
+
+        A curriculum is at its end here: episodes have the options' whole world.
+        """
+        return self._start(rng, Course.at(1.0))
+
+    def restart(self, rng: Array, ended: State | None) -> State:
+        """As `reset`, in training: with what the curriculum allows, if there is one.
+
+        Args:
+            rng: Key.
+            ended: Last state of the environment's episode before; None: it is the
+                first.
+        """
+        if not self.options.obstacle_curriculum:
+            return self.reset(rng)
+        before = Course.at(0.0) if ended is None else ended.info["course"].following()
+        return self._start(rng, before)
+
+    def _start(self, rng: Array, course: Course) -> State:
+        """A start with no more than the curriculum's level of the options' spheres."""
         rng, key_q, key_task, key_spheres, key_motion = jax.random.split(rng, 5)
         model, n = self.scene.model, self.robot.n
         q = jnp.asarray(self.robot.q_home, jnp.float32)
         q = q + self.options.start_noise * jax.random.normal(key_q, (n,))
         objects, task = self.begin(key_task, q)
-        centers, placed = self._place(key_spheres, q, task)
-        spheres = Spheres.start(key_motion, placed, self.options.obstacle_speed)
+        centers, spheres = self._spheres(key_spheres, key_motion, course.level, q, task)
         data = self.physics.init(
             jnp.concatenate([q, objects]), jnp.zeros(model.nv), centers
         )
         return State(
             data=data,
-            obs=self._observation(data, self.site(data), task),
+            obs=self._observation(data, self.site(data), task, spheres, rng),
             reward=jnp.zeros(()),
             done=jnp.zeros(()),
             metrics={name: jnp.zeros(()) for name in self.metrics},
@@ -73,27 +94,27 @@ class ArmEnv(World[OptionsT]):
                 "control": self.remember(q),
                 "active_events": SafetyRecord.empty().events,
                 "task": task,
-            },
+            }
+            | ({"course": course} if self.options.obstacle_curriculum else {}),
         )
 
     def step(self, state: State, action: Float[Array, " 12"]) -> State:
         """Hold the action for one policy step and score where it led."""
         options, info = self.options, state.info
         rng, key = jax.random.split(info["rng"])
-        error = options.obstacle_noise * jax.random.normal(key, (self.scene.spheres, 3))
         data, spheres, control, setpoint, record = self.drive(
             state.data,
             info["spheres"],
             action,
             info["control"],
-            error,
+            self._error(key),
             self.dt * info["step"],
             jax.random.fold_in(key, 1),
         )
         step = info["step"] + 1
         site = self.site(data)
         score = self.score(data, site, record, state.task, step)
-        obs = self._observation(data, site, score.task)
+        obs = self._observation(data, site, score.task, spheres, rng)
         finite = jnp.all(jnp.isfinite(obs)) & jnp.all(jnp.abs(data.qvel) < TOO_FAST)
         bad = ~finite
         reward = score.reward - jnp.where(record.event, options.event_penalty, 0.0)
@@ -104,12 +125,16 @@ class ArmEnv(World[OptionsT]):
             contact_impulse=record.contact_force * self.dt,
             clearance=self.clearance(data, spheres),
             tracking_error=jnp.linalg.norm(setpoint.p_des - site.p),
-            unplaced_obstacles=jnp.sum(~spheres.placed),
+            unplaced_obstacles=spheres.missing,
             nonfinite=bad,
         )
         active = info["active_events"]
         begun = {name: on & ~active[name] for name, on in record.events.items()}
         metrics = begun | record.values | measured.values | score.metrics
+        course = {}
+        if options.obstacle_curriculum:
+            course["course"] = info["course"].then(score.success, record.event)
+            metrics[LEVEL.name] = info["course"].level
         return state.replace(
             data=data,
             obs=jnp.where(bad, 0.0, obs),
@@ -129,29 +154,57 @@ class ArmEnv(World[OptionsT]):
                 "control": control,
                 "active_events": record.events,
                 "task": score.task,
-            },
+            }
+            | course,
         )
 
-    def _place(
-        self, rng: Array, q: Array, task: dict[str, Array]
-    ) -> tuple[Array, Array]:
-        """Sphere centres and which found a place; the others wait far below."""
-        centers, placed = place_spheres(
-            rng,
-            self.scene.spheres,
-            self.options.sphere_radius,
-            self.options.layout,
+    def _spheres(
+        self,
+        key_place: Array,
+        key_motion: Array,
+        level: Array | float,
+        q: Array,
+        task: dict[str, Array],
+    ) -> tuple[Array, Spheres]:
+        """Centres and state of an episode's spheres; unused slots wait far below."""
+        options, slots = self.options, self.scene.spheres
+        centers, fits = place_spheres(
+            key_place,
+            slots,
+            options.sphere_radius,
+            options.layout,
             *self.sphere_box,
             self.keep_clear(task),
             point_positions(self.robot, q),
             jnp.asarray(self.robot.points.radius),
         )
-        return jnp.where(placed[:, None], centers, jnp.array(AWAY)), placed
+        # Keys of their own: the default options draw nothing more than they always did.
+        key_count, key_speed = (
+            jax.random.fold_in(key, 1) for key in (key_place, key_motion)
+        )
+        wanted = draw_count(key_count, slots, options.obstacle_count == "random", level)
+        speed = draw_speed(
+            key_speed,
+            options.obstacle_speed * level,
+            options.obstacle_motion == "always",
+        )
+        spheres = Spheres.start(key_motion, wanted, fits, speed)
+        return jnp.where(spheres.placed[:, None], centers, jnp.array(AWAY)), spheres
+
+    def _error(self, key: Array) -> Array:
+        """Error of the spheres' measured positions in a policy step, (k, 3) [m]."""
+        noise = jax.random.normal(key, (self.scene.spheres, 3))
+        return self.options.obstacle_noise * noise
 
     def _observation(
-        self, data: PhysicsState, site: SiteState, task: dict[str, Array]
+        self,
+        data: PhysicsState,
+        site: SiteState,
+        task: dict[str, Array],
+        spheres: Spheres,
+        rng: Array,
     ) -> Array:
-        """All entries in one vector."""
+        """All entries in one vector; `rng` is the key of the next step."""
         values = {
             "position": site.p,
             "rotation": site.R,
@@ -159,4 +212,14 @@ class ArmEnv(World[OptionsT]):
             "angular_velocity": site.w,
         }
         values |= self.observe(data, site, task)
+        if self.options.seen_spheres:
+            # The measurement that the controller gets in the next step.
+            error = self._error(jax.random.split(rng)[1])
+            values |= sight.look(
+                self.options.seen_spheres,
+                site,
+                self.obstacles(data, spheres, error).spheres,
+                point_positions(self.robot, data.qpos[: self.robot.n]),
+                jnp.asarray(self.robot.points.radius),
+            )
         return jnp.concatenate([values[e.name].reshape(-1) for e in self.entries])

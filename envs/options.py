@@ -35,6 +35,7 @@ _AT_LEAST_ZERO = (
     "observer_noise",
     "observer_delay",
     "observer_dead_band",
+    "seen_spheres",
     "start_noise",
 )
 
@@ -64,12 +65,20 @@ class Options:
     """MuJoCo's friction cone."""
     obstacles: int = 0
     """Random spheres, new in every episode."""
+    obstacle_count: Literal["fixed", "random"] = "fixed"
+    """fixed: every episode has `obstacles` spheres; random: 0 to `obstacles`."""
     sphere_radius: float = 0.05
     """Their radius [m]."""
     layout: Layout = "far"
     """How near they may be at the start."""
     obstacle_speed: float = 0.0
     """Speed of the spheres, each in a random direction [m/s]."""
+    obstacle_motion: Literal["always", "sometimes"] = "always"
+    """always: they have that speed in every episode; sometimes: they rest in half of
+    the episodes, and have any speed up to it in the others."""
+    obstacle_curriculum: bool = False
+    """In training, begin without spheres: an environment gets more and faster ones
+    after an episode that is solved, fewer and slower ones after an event."""
     obstacle_noise: float = 0.0
     """Standard deviation of the sphere positions that the controller sees, drawn
     anew at every policy step [m]."""
@@ -87,6 +96,8 @@ class Options:
     """Delay of the observer's torque [s]; a multiple of `sim_dt`."""
     observer_dead_band: float = 0.0
     """Torque of a joint that the observer counts as none [N m]."""
+    seen_spheres: int = 0
+    """The policy sees so many nearest spheres, as the controller sees them; 0: none."""
     event_penalty: float = 50.0
     """Cost of a collision or joint-limit event."""
     terminate_on_event: bool = True
@@ -142,12 +153,15 @@ class Options:
         """The obstacles in words."""
         if not self.obstacles:
             return "no obstacles"
+        upto = {"random": "up to ", "sometimes": "up to "}
+        count = upto.get(self.obstacle_count, "")
+        words = {"speed": f"speed {upto.get(self.obstacle_motion, '')}"}
         extra = [
-            f", {name} {value:g}"
+            f", {words.get(name, f'{name} ')}{value:g}"
             for name in ("speed", "noise", "delay")
             if (value := getattr(self, f"obstacle_{name}"))
         ]
-        return f"{self.obstacles} spheres ({self.layout}{''.join(extra)})"
+        return f"{count}{self.obstacles} spheres ({self.layout}{''.join(extra)})"
 
     @property
     def observer_steps(self) -> int:

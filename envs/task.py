@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from envs import sight
 from envs.options import Options as TaskOptions
 from envs.safety import SafetyRecord
 from envs.scene import Contacts, no_objects
@@ -159,7 +160,8 @@ class Task(abc.ABC, Generic[OptionsT]):
     @property
     def entries(self) -> tuple[Entry, ...]:
         """The observation, entry by entry."""
-        return ARM_ENTRIES + self.task_entries
+        seen = sight.entries(self.options.seen_spheres)
+        return ARM_ENTRIES + self.task_entries + seen
 
     @property
     def observation_size(self) -> int:

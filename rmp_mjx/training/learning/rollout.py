@@ -7,7 +7,7 @@ whole batch: a step in which no environment ends computes no reset.
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,15 @@ class Env(Protocol):
 
     def step(self, state: Any, action: Float[Array, " m"]) -> Any:
         """One policy step; done is 1 where the task itself ends."""
+        ...
+
+
+@runtime_checkable
+class Restarts(Protocol):
+    """An environment whose episodes in training depend on those before, if it can."""
+
+    def restart(self, rng: PRNGKeyArray, ended: Any) -> Any:
+        """A fresh start after an episode's last state; None: the first in training."""
         ...
 
 
@@ -181,7 +190,8 @@ def init(env: Env, keys: Key[Array, " b"], staggered: bool = False) -> RolloutSt
             out those that only this truncation ended.
     """
     keys_start, keys_age = split(keys)
-    env_state = jax.vmap(env.reset)(keys_start)
+    first = partial(env.restart, ended=None) if isinstance(env, Restarts) else env.reset
+    env_state = jax.vmap(first)(keys_start)
     env_state = cast_like(env_state, env_state)
     fold = episodes.start(reductions(env.metrics), keys.shape)
     age = jnp.zeros(keys.shape, jnp.int32)
@@ -236,7 +246,7 @@ def unroll(
 ) -> tuple[RolloutState, Transition, RolloutStats]:
     """Let a policy act for some steps in every environment.
 
-    An environment that ends is reset with a new key.
+    An environment that ends is reset with a new key (`Restarts`: restarted).
 
     Args:
         env: The environment.
@@ -252,7 +262,10 @@ def unroll(
     kinds = reductions(env.metrics)
 
     def reset_done(done, env_state, keys):
-        fresh = jax.vmap(env.reset)(keys)
+        if isinstance(env, Restarts):
+            fresh = jax.vmap(env.restart)(keys, env_state)
+        else:
+            fresh = jax.vmap(env.reset)(keys)
         return select(done, cast_like(fresh, env_state), env_state)
 
     def note_fault(fault, bad, env_state, action):
