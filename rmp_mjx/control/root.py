@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float
 
 from rmp_mjx.math import psd_solve
 
-ROUNDS = 16
-"""Most active sets that are tried."""
+ROUNDS, HURRIED = 64, 16
+"""Most active sets that are tried, and those before the last row that is wrong moves
+instead of the worst: slower, but it cannot go round in circles (Murty's rule)."""
 
 GIVE = 1e-3
 """Softness of a soft limit."""
@@ -153,8 +154,8 @@ def _pivoted(
 ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
     """`solve_root` without a look at whether the free solution fits."""
     dual = _dual(H, f, rows)
-    at_end = _pivot(dual)
-    return _held(dual, at_end), at_end
+    at_end, lam = _pivot(dual)
+    return dual.solution(lam), at_end
 
 
 class Dual(NamedTuple):
@@ -175,6 +176,10 @@ class Dual(NamedTuple):
     give: Float[Array, " m"]
     """Softness."""
 
+    def solution(self, lam: Float[Array, " m"]) -> Float[Array, " n"]:
+        """The acceleration under these multipliers, (n,)."""
+        return self.free - jnp.matmul(self.lift, lam, precision="highest")
+
 
 def _dual(H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows) -> Dual:
     dot = functools.partial(jnp.matmul, precision="highest")
@@ -193,65 +198,69 @@ def _dual(H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows) -> Dual:
     )
 
 
-def _multipliers(
-    dual: Dual, at_end: Float[Array, " m"]
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Multipliers that hold these rows at their ends, and where all rows then are."""
+def _multipliers(dual: Dual, at_end: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Multipliers that hold these rows at their ends, (m,); 0 for the others."""
     held = at_end != 0.0
     end = jnp.where(at_end > 0.0, dual.high, dual.low)
+    over = jnp.where(held, dual.t - jnp.where(held, end, 0.0), 0.0)
     both = held[:, None] & held[None]
     own = jnp.diag(jnp.where(held, dual.give, 1.0))
-    over = jnp.where(held, dual.t - jnp.where(held, end, 0.0), 0.0)
-    lam = psd_solve(jnp.where(both, dual.W, 0.0) + own, over)
-    return lam, dual.t - jnp.matmul(dual.W, lam, precision="highest")
+    return _eliminate(jnp.where(both, dual.W, 0.0) + own, over)
 
 
-def _pivot(dual: Dual) -> Float[Array, " m"]:
-    """The rows at their ends in the solution."""
-    tiny = 8.0 * jnp.finfo(dual.t.dtype).eps
-    slack = tiny * (jnp.abs(dual.low) + jnp.abs(dual.high))
+def _eliminate(A: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Solve A x = b by Gauss-Jordan elimination, for A with a unit diagonal, PSD.
 
-    def judge(at_end):
+    As a loop it compiles faster than `psd_solve`. Few states come here.
+    """
+    floor = len(b) * jnp.finfo(b.dtype).eps
+
+    def clear(k, rows):
+        row = rows[k] / jnp.maximum(rows[k, k], floor)
+        rows = rows - rows[:, k][:, None] * row[None]
+        return rows.at[k].set(row)
+
+    rows = jnp.concatenate([A, b[:, None]], axis=1)
+    return jax.lax.fori_loop(0, len(b), clear, rows)[:, -1]
+
+
+def _pivot(dual: Dual) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """The rows at their ends in the solution, and the multipliers of all rows."""
+    slack = 8.0 * jnp.finfo(dual.t.dtype).eps * (jnp.abs(dual.low) + jnp.abs(dual.high))
+
+    def belongs(at_end, lam):
         """Where each row belongs, given the others, and how wrong it is now."""
-        lam, t = _multipliers(dual, at_end)
+        t = dual.t - jnp.matmul(dual.W, lam, precision="highest")
         over = (t > dual.high + slack).astype(t.dtype)
         under = (t < dual.low - slack).astype(t.dtype)
         free = at_end == 0.0
         leaves = lam * at_end < 0.0
-        belongs = jnp.where(free, over - under, jnp.where(leaves, 0.0, at_end))
+        better = jnp.where(free, over - under, jnp.where(leaves, 0.0, at_end))
         beyond = jnp.maximum(t - dual.high, dual.low - t)
         wrong = jnp.where(free, beyond, -lam * at_end)
-        return belongs, jnp.where(belongs == at_end, -jnp.inf, wrong)
+        return better, jnp.where(better == at_end, -jnp.inf, wrong)
 
     def goes_on(state):
-        at_end, belongs, _, _, _, count = state
-        return jnp.any(at_end != belongs) & (count < ROUNDS)
+        at_end, better, _, _, _, _, count = state
+        return jnp.any(at_end != better) & (count < ROUNDS)
 
     def move(state):
-        at_end, belongs, wrong, fewest, patience, count = state
-        number = jnp.sum(at_end != belongs)
+        at_end, better, wrong, _, fewest, patience, count = state
+        number = jnp.sum(at_end != better)
         fewer = number < fewest
-        all_at_once = fewer | (patience > 0)
-        worst = jnp.arange(len(wrong)) == jnp.argmax(wrong)
-        at_end = jnp.where(all_at_once | worst, belongs, at_end)
+        last = jnp.max(jnp.where(at_end != better, index, -1))
+        one = index == jnp.where(count < HURRIED, jnp.argmax(wrong), last)
+        at_end = jnp.where(fewer | (patience > 0) | one, better, at_end)
         patience = jnp.where(fewer, 1, jnp.maximum(patience - 1, 0))
-        return (
-            at_end,
-            *judge(at_end),
-            jnp.minimum(fewest, number),
-            patience,
-            count + 1,
-        )
+        fewest = jnp.minimum(fewest, number)
+        lam = _multipliers(dual, at_end)
+        return at_end, *belongs(at_end, lam), lam, fewest, patience, count + 1
 
-    none = jnp.zeros_like(dual.t)
-    start = (none, *judge(none), jnp.array(len(none) + 1), jnp.array(1), jnp.array(0))
-    return jax.lax.while_loop(goes_on, move, start)[0]
-
-
-def _held(dual: Dual, at_end: Float[Array, " m"]) -> Float[Array, " n"]:
-    """The solution with these rows held at their ends, (n,)."""
-    lam, _ = _multipliers(dual, at_end)
-    return dual.free - jnp.matmul(dual.lift, lam, precision="highest")
+    none, index = jnp.zeros_like(dual.t), jnp.arange(len(dual.t))
+    counts = (jnp.array(len(none) + 1), jnp.array(1), jnp.array(0))
+    state = (none, *belongs(none, none), none, *counts)
+    at_end, _, _, lam, *_ = jax.lax.while_loop(goes_on, move, state)
+    return at_end, lam
 
 
 @solve_root.defjvp
@@ -259,7 +268,8 @@ def _derivative(primals, tangents):
     qdd, at_end = solve_root(*primals)
 
     def held(H, f, rows):
-        return _held(_dual(H, f, rows), at_end)
+        dual = _dual(H, f, rows)
+        return dual.solution(_multipliers(dual, at_end))
 
     _, change = jax.jvp(held, primals, tangents)
     return (qdd, at_end), (change, jnp.zeros_like(at_end))
