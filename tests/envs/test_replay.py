@@ -25,6 +25,8 @@ CONFIG = make_config(
     obstacles=1,
     obstacle_speed=0.1,
     obstacle_noise=0.01,
+    observer="momentum",
+    observer_noise=0.01,
 )
 
 

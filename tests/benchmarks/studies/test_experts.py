@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import envs
-from benchmarks.studies import experts
+from benchmarks.studies import experts, observer
 
 QUIET = ("success", "collision", "self_collision", "joint_limit", "work_force")
 
@@ -68,3 +68,18 @@ def test_an_expert_opens_the_door_without_an_event():
 
 def test_every_task_has_an_expert():
     assert {case.task for case in experts.CASES} == set(envs.names())
+
+
+def test_an_observers_delay_and_errors_are_found():
+    """Random torques for 1 s, then 1 s of rest; felt 10 % too weak, 3 steps late."""
+    acted = np.random.default_rng(0).normal(size=(400, 2, 7))
+    acted[200:] = 0.0
+    trace = observer.Trace(measured=None, acted=acted, dt=0.005)
+    felt = np.roll(0.9 * acted, 3, axis=0)
+    felt[300:] = 0.01
+    figures = observer.judge(trace, felt)
+    assert figures["delay"] == pytest.approx(15.0)
+    assert figures["shifted"] == pytest.approx(0.1, abs=0.01)
+    assert figures["torque"] == pytest.approx(np.sqrt(7), rel=0.05)
+    assert figures["median"] == pytest.approx(1.9**0.5 * np.sqrt(7), rel=0.1)
+    assert figures["false"] == pytest.approx(0.01 * np.sqrt(7))
