@@ -10,7 +10,7 @@ assumes.
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -119,7 +119,7 @@ class StopGuard(Pytree):
     is then about the arm's own speed towards what touches it."""
 
     @classmethod
-    def of(cls, robot: Robot, step: float = 0.005, **options: Any) -> Self:
+    def of(cls, robot: Robot, step: float = 0.005, **options: Any) -> StopGuard:
         """The guard of an arm.
 
         Args:
