@@ -64,6 +64,10 @@ class Shape(Pytree, abc.ABC):
         Positions x and velocities v are (1, p) each.
         """
 
+    def greatest_speed(self) -> Float[Array, " o"]:
+        """Greatest speed of any point of each obstacle's core, (o,) [m/s]."""
+        return _norm(self.velocity)
+
     def _avoided(self, hand: Bool[np.ndarray, " p"]) -> Bool[Array, "o p"]:
         """Which control points avoid which obstacles."""
         exempt = self.hand_may_touch[:, None] & hand[None]
@@ -133,6 +137,10 @@ class Capsules(Turning):
     half_length: Float[Constant, " o"]
     """Half the segment's length [m]."""
 
+    def greatest_speed(self) -> Float[Array, " o"]:
+        """Greatest speed of any point of each segment, (o,) [m/s]."""
+        return _norm(self.velocity) + _norm(self.angular_velocity) * self.half_length
+
     def gap(
         self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
     ) -> Gap:
@@ -154,6 +162,11 @@ class Boxes(Turning):
     """Orientation (columns are the box's axes)."""
     half_size: Float[Constant, "o 3"]
     """Half sizes of the core [m]."""
+
+    def greatest_speed(self) -> Float[Array, " o"]:
+        """Greatest speed of any point of each core, (o,) [m/s]."""
+        spin = _norm(self.angular_velocity) * _norm(self.half_size)
+        return _norm(self.velocity) + spin
 
     def gap(
         self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
@@ -187,6 +200,10 @@ class Boxes(Turning):
             normal=axes[0] * n.x + axes[1] * n.y + axes[2] * n.z,
             distance=jnp.where(inside, depth - radius, gap.distance),
         )
+
+
+def _norm(x: Constant) -> Array:
+    return jnp.sqrt(jnp.sum(jnp.asarray(x) ** 2, axis=-1))
 
 
 def _inflate(

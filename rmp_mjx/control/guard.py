@@ -22,7 +22,7 @@ from rmp_mjx.control.avoidance import _segment_gap
 from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant, Pytree
-from rmp_mjx.robot.bounds import Bounds, squares_of
+from rmp_mjx.robot.bounds import Bounds, centre_levers, squares_of
 from rmp_mjx.robot.dynamics import holding_torque
 from rmp_mjx.robot.kinematics import (
     ArmState,
@@ -33,15 +33,15 @@ from rmp_mjx.robot.kinematics import (
 )
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import point_state
-from rmp_mjx.shapes import Boxes, Capsules, Planes, Shape
+from rmp_mjx.shapes import Planes
 from rmp_mjx.vec import Vec
 
 FADE = 0.5
 """A slow point that is inside the margin may approach by its distance in this time
 [s]: it never arrives at a body at rest."""
 
-LONGEST = 1.0
-"""Time of a stop [s] where the motors cannot stop the arm at all."""
+STAGES = (0.2, 1.0)
+"""Shares of the longest stop for which a stop is computed."""
 
 ROUNDING = 1e-5
 """What a step must have to spare over what its stop needs [m], for float32."""
@@ -63,6 +63,8 @@ class Scene(NamedTuple):
     """Mq v and Mq w."""
     rest: Float[Array, " n"]
     """Torque that holds the arm at rest, contacts included [N m]."""
+    levers: Float[Array, "n n"]
+    """Of the links' centres of mass, see `centre_levers` [m]."""
     points: tuple[Vec, Vec]
     """Velocities of the control points at v and w, (p,) [m/s]."""
     spins: tuple[Vec, Vec]
@@ -112,6 +114,8 @@ class StopGuard(Pytree):
     """Error of the velocity that is predicted for the next step [rad/s]."""
     reserve: Float[Constant, ""] | float = 0.05
     """Share of the torque that a stop leaves unused."""
+    longest: Float[Constant, ""] | float = 0.15
+    """Longest stop [s]. More serves heavy or weak arms, but widens the bounds."""
     blends: tuple[float, ...] = struct.field(pytree_node=False, default=(1.0, 0.5, 0.2))
     """Shares of the controller's torque that are tried; the rest is the stop's."""
     leaving: bool = struct.field(pytree_node=False, default=False)
@@ -226,8 +230,10 @@ class StopGuard(Pytree):
             rates = tuple(
                 gap.normal @ x.map(lambda c: c[None]) for x in (points.v, at_w)
             )
-            fastest, error = self._obstacle(kind)
-            distance = gap.distance - scallop[None] - error
+            fastest, distance = kind.greatest_speed(), gap.distance - scallop[None]
+            if not isinstance(kind, Planes):
+                fastest = jnp.maximum(fastest, self.obstacle_speed)
+                distance = distance - self.obstacle_error
             rows.append((distance, rates, fastest[:, None], gap.active))
         return Scene(
             robot=robot,
@@ -235,22 +241,12 @@ class StopGuard(Pytree):
             w=w,
             momenta=(_dot(Mq, arm.qd), _dot(Mq, w)),
             rest=holding_torque(robot, arm) - ext,
+            levers=centre_levers(robot, arm),
             points=(points.v, at_w),
             spins=(arm.V.ang, V.ang),
             rows=rows,
             pairs=_pairs(robot, arm, V),
         )
-
-    def _obstacle(self, kind: Shape) -> tuple[Array, Array | float]:
-        """Greatest speed of a kind's obstacles, (o,) [m/s], and their error [m]."""
-        speed = _norm(kind.velocity)
-        if isinstance(kind, Planes):
-            return speed, 0.0
-        if isinstance(kind, Boxes):
-            speed = speed + _norm(kind.angular_velocity) * _norm(kind.half_size)
-        if isinstance(kind, Capsules):
-            speed = speed + _norm(kind.angular_velocity) * kind.half_length
-        return jnp.maximum(speed, self.obstacle_speed), self.obstacle_error
 
     def _stop(
         self, scene: Scene, u: Float[Array, " n"], Mu: Float[Array, " n"], lag: Any
@@ -259,7 +255,7 @@ class StopGuard(Pytree):
 
         The torque on the line is $g(q) - M_q(q) u / T$ and Coriolis. Its values at the
         present q and bounds of their change give, for every joint, $|p| / T + B T
-        \le C$.
+        \le C$. The bounds are for stops of some length; a few `STAGES` are tried.
 
         Args:
             scene: The state.
@@ -267,23 +263,32 @@ class StopGuard(Pytree):
             Mu: Mq u, (n,).
             lag: 1 if the stop starts after a step from here, 0 if it starts here.
         """
-        bounds, dtype = self.bounds, u.dtype
+        stages = self.longest * jnp.asarray(STAGES, u.dtype)
+        within = functools.partial(self._stop_within, scene, u, Mu, lag)
+        times, possible = jax.vmap(within)(stages)
+        best = jnp.min(jnp.where(possible, times, jnp.inf))
+        return jnp.minimum(best, times[-1]), jnp.any(possible)
+
+    def _stop_within(
+        self, scene: Scene, u: Array, Mu: Array, lag: Any, longest: Array
+    ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        """The same with bounds for stops of at most `longest` [s]."""
+        dtype, size, ahead = u.dtype, jnp.abs(u), lag * self.step
         tau_max = jnp.asarray(scene.robot.tau_max, dtype)
-        size, squares = squares_of(u)
-        inertia = _dot(squares, bounds.inertia)
-        load = _dot(size, bounds.load)
-        ahead = lag * self.step
+        R = self.bounds.levers(scene.levers, u, longest + ahead)
+        coriolis, inertia, load = self.bounds.torques(scene.robot, R, u)
         unused = 0.5 * self.reserve * (1.0 + lag)
         room = (1.0 - unused) * tau_max - jnp.asarray(self.damping, dtype) * size
-        room = room - _dot(squares, bounds.coriolis) - 0.5 * inertia - ahead * load
+        room = room - coriolis - 0.5 * inertia - ahead * load
         need = jnp.abs(Mu) + ahead * inertia
         C, B = room + jnp.sign(Mu) * scene.rest, 0.5 * load
         root = C * C - 4.0 * B * need
         fits = (C > 0.0) & (root >= 0.0)
         shortest = 2.0 * need / (C + jnp.sqrt(jnp.where(fits, root, 1.0)))
-        T = jnp.maximum(jnp.max(jnp.where(fits, shortest, LONGEST)), self.step)
+        T = jnp.maximum(jnp.max(jnp.where(fits, shortest, longest)), self.step)
         left = room - T * B + SLACK * tau_max
         moving = jnp.abs(scene.rest - Mu / T) + ahead * inertia / T <= left
+        fits &= longest >= T
         return T, jnp.all(fits & moving & (jnp.abs(scene.rest) <= left))
 
     def _judge(self, scene: Scene, a: Array, b: Array, lag: Array) -> Bool[Array, ""]:
@@ -389,10 +394,6 @@ def _carrier(robot: Robot) -> Float[np.ndarray, "n p"]:
 
 def _length(v: Vec) -> Array:
     return jnp.sqrt(v @ v)
-
-
-def _norm(x: Constant) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.asarray(x) ** 2, axis=-1))
 
 
 def _dot(a: Array, b: Constant) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rmp_mjx.pytree import Constant, Pytree
+from rmp_mjx.robot.kinematics import ArmState, Motion, carry_points
 from rmp_mjx.robot.model import Robot
 
 
@@ -23,12 +24,10 @@ class Bounds(Pytree):
     """As `lever`, for pairs of link capsules: the joints between the two only."""
     pair_bend: Float[Constant, "n*n k"]
     """As `bend`, for those pairs."""
-    coriolis: Float[Constant, "n*n n"]
-    """Coriolis torque for the products of two joints' speeds [N m s^2/rad^2]."""
-    inertia: Float[Constant, "n*n n"]
-    """Rate of change of Mq v along v, likewise [N m s^2/rad^2]."""
-    load: Float[Constant, "n n"]
-    """Rate of change of the holding torque i with joint j [N m/rad]."""
+    centre: Float[Constant, "n n"]
+    """As `lever`, for the links' centres of mass [m]."""
+    spin: Float[Constant, " n"]
+    """Greatest principal inertia of each link [kg m^2]."""
     scallop: Float[Constant, " p"]
     """How far a link sticks out between its control points [m]."""
 
@@ -74,33 +73,73 @@ class Bounds(Pytree):
             pair_lever[i] = np.where((joints > b) & (joints <= a), lever[a], 0.0)
 
         centre = np.stack([row(k, robot.com[k], 0.0) for k in range(n)])
-        spin = np.linalg.eigvalsh(robot.inertia)[:, -1]
-        later = np.maximum.outer(joints, joints)
-        coriolis, inertia, load = (np.zeros((n, n, n)) for _ in range(3))
-        for k in range(n):
-            inner, moved = joints <= k, later <= k
-            bend = np.where(moved, centre[k][later], 0.0)
-            turn = np.where(moved, spin[k], 0.0)
-            swing = np.where(moved, centre[k][later], 0.0)
-            for i in range(k + 1):
-                wrench = robot.mass[k] * centre[k, i] * bend
-                drag = robot.mass[k] * np.outer(swing[i], centre[k] * inner)
-                coriolis[i] += wrench + 1.5 * turn
-                inertia[i] += wrench + 0.5 * (drag + drag.T) + 3.5 * turn
-            load[k] = robot.mass[k] * bend
-        weight = np.linalg.norm(robot.gravity) * load.sum(axis=0)
-        if robot.stiffness is not None:
-            weight = weight + np.diag(robot.stiffness)
         return Bounds(
             lever=lever,
             bend=_bend(lever),
             pair_lever=pair_lever,
             pair_bend=_bend(pair_lever),
-            coriolis=coriolis.reshape(n, -1).T,
-            inertia=inertia.reshape(n, -1).T,
-            load=weight,
+            centre=centre,
+            spin=np.linalg.eigvalsh(robot.inertia)[:, -1],
             scallop=_scallop(robot),
         )
+
+    def levers(
+        self, now: Float[Array, "n n"], u: Float[Array, " n"], way: Array | float
+    ) -> Float[Array, "n n"]:
+        """Levers of the centres of mass everywhere on a line in the joints.
+
+        Args:
+            now: Levers where it begins, see `centre_levers`, (n, n) [m].
+            u: Its direction, (n,) [rad/s].
+            way: Its length [s].
+        """
+        moving = jnp.asarray(self.centre, u.dtype) * jnp.abs(u)[None]
+        between = jnp.asarray(np.tril(np.ones((len(u), len(u))), -1), u.dtype)
+        gain = jnp.matmul(moving, between, precision="highest")
+        return jnp.minimum(jnp.asarray(self.centre, u.dtype), now + way * gain)
+
+    def torques(
+        self, robot: Robot, R: Float[Array, "n n"], u: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        """Bounds of torques on a line in the joints, from the levers R on it.
+
+        Returns:
+            The Coriolis torque at velocity u [N m]; the rate at which Mq u changes on
+            the line [N m]; that of the torque that holds the arm [N m/s].
+        """
+        dtype, size = u.dtype, jnp.abs(u)
+        mass = jnp.asarray(robot.mass, dtype)
+        inner = jnp.cumsum(size)
+
+        def pulled(x: Array) -> Array:
+            return jnp.matmul(x, R, precision="highest")
+
+        def swung(x: Array) -> Array:
+            """As `pulled`, for the joint columns' rates of change."""
+            each = pulled(x)
+            outer = jnp.cumsum((size * each)[::-1])[::-1] - size * each
+            return inner * each + outer
+
+        bend = mass * jnp.sum(R * (size * (2.0 * inner - size))[None], axis=1)
+        speed = mass * jnp.sum(R * size[None], axis=1)
+        turn = jnp.cumsum((jnp.asarray(self.spin, dtype) * inner**2)[::-1])[::-1]
+        load = jnp.sqrt(jnp.sum(jnp.asarray(robot.gravity, dtype) ** 2)) * swung(mass)
+        if robot.stiffness is not None:
+            load = load + jnp.asarray(robot.stiffness, dtype) * size
+        coriolis = pulled(bend)
+        return coriolis + 1.5 * turn, coriolis + swung(speed) + 3.5 * turn, load
+
+
+def centre_levers(robot: Robot, arm: ArmState) -> Float[Array, "n n"]:
+    """Distances of the links' centres of mass from the joint axes, (n, n) [m].
+
+    Row k is link k's; entries of joints that do not move it are 0.
+    """
+    c, _ = carry_points(robot, arm, robot.com, np.arange(robot.n))
+    S = Motion(*(part.map(lambda s: s[None]) for part in (arm.S.lin, arm.S.ang)))
+    moved = S.at(c.map(lambda x: x[:, None]))
+    inner = np.tril(np.ones((robot.n, robot.n), bool))
+    return jnp.where(inner, jnp.sqrt(jnp.where(inner, moved @ moved, 1.0)), 0.0)
 
 
 def _bend(lever: np.ndarray) -> np.ndarray:
