@@ -116,9 +116,11 @@ def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
     """Every row of one process."""
     robot = rmp.Robot.load("jaco2")
     batch, seconds, calls = (256, 0.5, 200) if quick else (BATCH, 10.0, 20_000)
+    guard = rmp.StopGuard.of(robot)
     named = [
         ("controller", "", rmp.RMPVICES(robot)),
         ("vices", "", rmp.VICES(robot)),
+        ("controller", "_guarded", rmp.RMPVICES(robot, guard=guard)),
     ]
     if autodiff:
         named.append(("controller", "_autodiff", AutodiffRMPVICES(robot)))

@@ -30,7 +30,6 @@ from rmp_mjx import runtime, sim
 from rmp_mjx.control.guard import StopGuard
 from rmp_mjx.metric import SUCCESS, Metric, by_name
 from rmp_mjx.pytree import Pytree
-from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.sim.base import pair_sensors
@@ -82,7 +81,7 @@ class Guarded(Pytree):
         robot = self.controller.robot
         out = self.controller(q, qd, setpoint, obstacles)
         arm = arm_state(robot, q, qd)
-        tau, found = self.guard(robot, arm, out.tau, *dynamics(robot, arm), obstacles)
+        tau, found = self.guard(robot, arm, out.tau, out.Mq, out.bias, obstacles)
         tau = jnp.where(self.on, tau, out.tau)
         return out.replace(tau=tau, diagnostics=out.diagnostics | found)
 

@@ -94,7 +94,8 @@ class FilteredVICES(VICES):
         Raises:
             ValueError: An argument has a wrong shape or dtype.
         """
-        out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
+        unguarded = super(FilteredVICES, self.replace(guard=None)).__call__
+        out = unguarded(q, qd, setpoint, obstacles, tau_ext, tau_last)
         q, qd, Mq, bias = jnp.asarray(q), jnp.asarray(qd), out.Mq, out.bias
         arm = arm_state(self.robot, q, qd)
         wanted = psd_solve(Mq, out.tau - bias)
@@ -103,12 +104,13 @@ class FilteredVICES(VICES):
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
         low, high = torque_range(self.robot, tau_last, self.period)
         tau, limit = clip_torque(dynamic + bias, low, high)
-        return out.replace(
+        out = out.replace(
             tau=tau,
             qdd=qdd,
             f=dynamic,
             diagnostics={"torque_limit": limit, "solved": solved},
         )
+        return self.guarded(out, arm, obstacles, tau_ext)
 
     def barriers(
         self,

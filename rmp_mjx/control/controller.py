@@ -10,9 +10,11 @@ from jaxtyping import Array, ArrayLike, Float, Real
 
 from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.arguments import check, check_action
+from rmp_mjx.control.guard import StopGuard
+from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant, Pytree
-from rmp_mjx.robot.kinematics import site_pose
+from rmp_mjx.robot.kinematics import ArmState, site_pose
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 
@@ -62,6 +64,9 @@ class ImpedanceController(Pytree):
     """Physical meaning of a policy action in [-1, 1]^12."""
     period: Float[Constant, ""] | float = struct.field(default=0.005, kw_only=True)
     """Time between two calls [s], for the limits of speed and torque rate."""
+    guard: StopGuard | None = struct.field(default=None, kw_only=True)
+    """Sends a torque only if the arm can stop after it, see `StopGuard`; None: off. Its
+    diagnostics join the controller's."""
 
     def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
         """Physical units of a policy's action in [-1, 1]^12, (12,).
@@ -91,3 +96,31 @@ class ImpedanceController(Pytree):
         check_action(action)
         p, R = site_pose(self.robot, jnp.asarray(q))
         return compose_setpoint(p, R, action, time)
+
+    def guarded(
+        self,
+        out: ControlOutput,
+        arm: ArmState,
+        obstacles: Obstacles,
+        tau_ext: Float[ArrayLike, " n"] | None,
+    ) -> ControlOutput:
+        """What is sent of an output: itself without a guard.
+
+        Args:
+            out: The controller's own output.
+            arm: The arm's state.
+            obstacles: Obstacle slots.
+            tau_ext: Joint torque of the contacts, (n,) [N m], if known.
+        """
+        if self.guard is None:
+            return out
+        ext = None if tau_ext is None else jnp.asarray(tau_ext)
+        tau, found = self.guard(
+            self.robot, arm, out.tau, out.Mq, out.bias, obstacles, ext
+        )
+        changed = psd_solve(out.Mq, tau - out.bias)
+        return out.replace(
+            tau=tau,
+            qdd=jnp.where(found["guard_used"] > 0.0, changed, out.qdd),
+            diagnostics=out.diagnostics | found,
+        )

@@ -145,7 +145,7 @@ class RMPVICES(ImpedanceController):
             branches.append(slowing.posture(q, qd, Mq))
         root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
         solution = self.resolve(root, Mq, bias, qd, w, tau_last)
-        return ControlOutput(
+        out = ControlOutput(
             tau=solution.tau,
             qdd=solution.qdd,
             f=root.f,
@@ -160,6 +160,7 @@ class RMPVICES(ImpedanceController):
                 "orientation_weight": orientation_weight,
             },
         )
+        return self.guarded(out, arm, obstacles, tau_ext)
 
     def resolve(
         self,

@@ -81,7 +81,7 @@ class VICES(ImpedanceController):
         dynamic = _dot(J.T, wrench) + null
         low, high = torque_range(self.robot, tau_last, self.period)
         tau, limit = clip_torque(dynamic + bias, low, high)
-        return ControlOutput(
+        out = ControlOutput(
             tau=tau,
             qdd=psd_solve(Mq, dynamic),
             f=dynamic,
@@ -90,6 +90,7 @@ class VICES(ImpedanceController):
             bias=bias,
             diagnostics={"torque_limit": limit},
         )
+        return self.guarded(out, arm, obstacles, tau_ext)
 
 
 def _dot(a: Array, b: Array) -> Array:

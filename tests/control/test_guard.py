@@ -366,6 +366,29 @@ def test_a_step_that_passes_is_the_controllers_own(robot, guard, one_step):
     assert found["guard_verified"] == 1.0
 
 
+def test_a_controller_sends_what_its_guard_lets_pass(robot, guard, vices, states):
+    """And its own torque, bit for bit, where that passes."""
+    obstacles = Obstacles.empty(spheres=1).with_spheres([[0.3, 0.1, 0.3]], 0.05)
+
+    @jax.jit(compiler_options=QUICK)
+    @jax.vmap
+    def both(q, qd, action):
+        setpoint = vices.setpoint(q, vices.decode(action), 0.0)
+        plain = vices(q, qd, setpoint, obstacles)
+        arm = arm_state(robot, q, qd)
+        sent, _ = guard(robot, arm, plain.tau, plain.Mq, plain.bias, obstacles)
+        return plain, sent, vices.replace(guard=guard)(q, qd, setpoint, obstacles)
+
+    plain, sent, out = jax.device_get(both(*map(np.float32, states(speed=0.3))))
+    passed = out.diagnostics["guard_used"] == 0.0
+    assert 0.1 < passed.mean() < 0.99
+    np.testing.assert_allclose(out.tau, sent, atol=1e-3)  # one program, fused anew
+    assert np.array_equal(out.tau[passed], plain.tau[passed])
+    assert np.array_equal(out.qdd[passed], plain.qdd[passed])
+    force = np.matmul(out.Mq, out.qdd[..., None])[..., 0] + out.bias
+    np.testing.assert_allclose(force[~passed], out.tau[~passed], atol=1e-2)
+
+
 def test_a_torque_that_is_no_number_is_not_sent(robot, guard, one_step):
     q = np.float32(robot.q_home)
     sent, found, _ = one_step(guard, q, 0 * q, np.float32(np.full(7, np.nan)))
