@@ -99,10 +99,10 @@ def obstacle_branch(
 
 
 def _accelerations(robot: Robot, arm: ArmState, x: Vec, w: Array) -> Vec:
-    """Accelerations of the control points at x by those of the joints, w."""
+    """Accelerations of the control points at x by those of the joints, w; (1, p)."""
     segment = np.array(robot.points.segment, int)
     carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
-    return select(motion_of(robot, arm.S, w), carrier).at(x)
+    return select(motion_of(robot, arm.S, w), carrier).at(x).map(lambda c: c[None])
 
 
 def _for_all_obstacles(parameter: Param) -> Param:

@@ -23,17 +23,18 @@ def changed(tree, **fields):
     return tree
 
 
-def _controlled(ctrl, q, qd, action, obstacles):
-    def one(q, qd, action, obstacles):
+def _controlled(ctrl, q, qd, action, obstacles, tau_ext=None):
+    def one(q, qd, action, obstacles, tau_ext):
         setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
-        return ctrl(q, qd, setpoint, obstacles)
+        return ctrl(q, qd, setpoint, obstacles, tau_ext)
 
-    return jax.vmap(one)(q, qd, action, obstacles)
+    return jax.vmap(one)(q, qd, action, obstacles, tau_ext)
 
 
 @pytest.fixture(scope="session")
 def run64():
-    """`run64(ctrl, q, qd, action, obstacles)`: outputs for BATCH states, float64."""
+    """`run64(ctrl, q, qd, action, obstacles, tau_ext)`: outputs for BATCH states, in
+    float64; without tau_ext nothing touches."""
     controlled = jax.jit(_controlled, compiler_options=QUICK)
 
     def run(*args):

@@ -59,6 +59,24 @@ def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, varied):
         assert np.max(np.abs(a - b) / scale) < tolerance, name
 
 
+@pytest.mark.parametrize("push", [3.0, 300.0])
+def test_closed_form_is_the_autodiff_tree_in_contact(run64, robot, inputs, push):
+    """Random contact torques, small ones and some beyond the cap: 1e-9 likewise."""
+    rng = np.random.default_rng(1)
+    tau_ext = push * rng.normal(size=(len(inputs[0]), 7)) * robot.tau_max / 30.5
+    fast = run64(RMPVICES(robot), *inputs, tau_ext)
+    slow = run64(AutodiffRMPVICES(robot), *inputs, tau_ext)
+    alone = run64(RMPVICES(robot), *inputs)
+    for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("qdd", 1e-7), ("tau", 1e-7)):
+        a, b, c = (
+            getattr(out, name).reshape(len(inputs[0]), -1)
+            for out in (fast, slow, alone)
+        )
+        scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
+        assert np.max(np.abs(a - b) / scale) < tolerance, name
+        assert np.max(np.abs(a - c) / scale) > 1e-3, name
+
+
 def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):
     """To rounding: 1e-9 of the largest entry."""
     near, n = collision_near(), len(robot.points.segment)
@@ -92,12 +110,14 @@ def _coordinates(node, x, t):
     return [(node, x)]
 
 
-def test_acceleration_is_that_of_the_flattened_least_squares(ctrl, inputs, fast):
+def test_acceleration_is_that_of_the_flattened_least_squares(run64, robot, inputs):
     """min sum |J_i qdd + c_i - a_i|^2_{M_i} + eps |qdd|^2_{Mq} by numpy's lstsq.
 
     One Jacobian of all leaf coordinates stacked, no message passing. 1e-7 relative:
-    row weights span six orders.
+    row weights span six orders. The motors have no limits.
     """
+    ctrl = RMPVICES(robot.replace(tau_max=np.full(7, 1e12)))
+    fast = run64(ctrl, *inputs)
 
     @quick_jit
     def leaf_terms(ctrl, q, qd, action, obstacles):
