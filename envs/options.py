@@ -84,6 +84,9 @@ class Options:
     anew at every policy step [m]."""
     obstacle_delay: float = 0.0
     """Delay of the sphere positions that the controller sees [s]."""
+    guard: bool = False
+    """Put `StopGuard` behind the controller, for spheres of this speed, noise and
+    delay."""
     observer: Literal["none", "momentum", "exact"] = "none"
     """What tells the controller the contacts' joint torque: nothing, a momentum
     observer, or its one-step form, which is exact in simulation and one step late."""

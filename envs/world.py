@@ -19,7 +19,7 @@ from envs.spheres import Spheres
 from envs.task import OptionsT, Task
 from envs.types import ControlMemory
 from rmp_mjx import sim
-from rmp_mjx.control import RMPVICES, Controller, Leaves
+from rmp_mjx.control import RMPVICES, Controller, Leaves, StopGuard
 from rmp_mjx.control.observer import ContactObserver
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
@@ -81,11 +81,24 @@ class World(Task[OptionsT]):
         """The options' controller; the task's leaves take the place of default ones."""
         controller = CONTROLLERS[self.options.controller](self.robot)
         controller = controller.replace(period=self.options.sim_dt)
+        if self.options.guard:
+            controller = controller.replace(guard=self._guard())
         collision = self.collision_leaves(self.robot)
         if collision and isinstance(controller, RMPVICES):
             default = controller.leaves == Leaves.default(self.robot)
             return controller.with_collision(collision) if default else controller
         return controller
+
+    def _guard(self) -> StopGuard:
+        """The guard of the arm, for the spheres of the options."""
+        options = self.options
+        seen_late = options.obstacle_speed * options.obstacle_delay
+        return StopGuard.of(
+            self.robot,
+            options.sim_dt,
+            obstacle_speed=options.obstacle_speed,
+            obstacle_error=seen_late + 4.0 * options.obstacle_noise,
+        )
 
     def _named_observer(self) -> ContactObserver | None:
         """The options' observer of contact torque."""

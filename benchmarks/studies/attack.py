@@ -21,7 +21,7 @@ from scipy import stats
 
 import envs
 import rmp_mjx as rmp
-from benchmarks.common import Row, show, write_json
+from benchmarks.common import Row, insert, markdown, show, write_json
 from envs.options import CTRL_DT
 from envs.safety import LIMIT_MARGIN
 from envs.scene import ARM
@@ -38,6 +38,9 @@ from rmp_mjx.training.learning.ppo import PPO, make_ppo
 
 SPHERES, RADIUS, SPEED = 3, 0.05, 0.2
 """Spheres, their radius [m] and their greatest speed [m/s]."""
+
+U = 0.05
+"""Speed of the arm at a contact that the guard allows [m/s]."""
 
 CONTROLLERS = {"rmp_vices": rmp.RMPVICES, "vices": rmp.VICES}
 """What is attacked."""
@@ -303,10 +306,39 @@ def rows_of(name: str, sums: dict[str, float], substeps: int) -> list[Row]:
     return rows
 
 
+def table(rows: list[Row]) -> str:
+    """The counts as a Markdown table, one line for each controller."""
+    value = {row.key: row.value for row in rows}
+    names = [
+        key.removesuffix("_control_steps")
+        for key in value
+        if key.endswith("_control_steps")
+    ]
+    keys = ("contacts", "moving", "limits", "mispredicted", "unproved")
+    head = (
+        "",
+        "control steps",
+        "contacts",
+        f"faster than {U * 100:g} cm/s",
+        "joint limits",
+        "mispredicted",
+        "unproved",
+    )
+    lines = []
+    for name in names:
+        steps = f"{value[f'{name}_control_steps']:,.0f}"
+        counts = [f"{value[f'{name}_{key}']:,.0f}" for key in keys]
+        if not name.endswith("_guarded"):
+            counts[3:] = ["-", "-"]
+        lines.append((f"`{name}`", steps, *counts))
+    return markdown(head, lines)
+
+
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the options."""
     parser = argparse.ArgumentParser(description="An attack on the guard.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--docs", type=Path, help="update the table of this page")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few steps")
     parser.add_argument("--seed", type=int, default=0, help="random seed")
     parser.add_argument("--envs", type=int, default=256, help="number of worlds")
@@ -330,9 +362,9 @@ def main(argv: list[str] | None = None) -> None:
         args.envs, args.train, args.steps = 16, 256, 256
     config = PPOConfig(num_envs=args.envs, seed=args.seed, entropy_cost=1e-3)
     robot = rmp.Robot.load("jaco2")
-    guard = StopGuard.of(robot, obstacle_speed=args.speed)
+    guard = StopGuard.of(robot, obstacle_speed=args.speed, speed=U)
     rows: list[Row] = []
-    settings = {k: v for k, v in vars(args).items() if k != "json"}
+    settings = {k: v for k, v in vars(args).items() if k not in ("json", "docs")}
     for name in args.controller or CONTROLLERS:
         start = time.perf_counter()
         controller = CONTROLLERS[name](robot)
@@ -351,6 +383,8 @@ def main(argv: list[str] | None = None) -> None:
             rows += new
             if args.json:
                 write_json(args.json, rows, **settings)
+    if args.docs:
+        args.docs.write_text(insert(args.docs.read_text(), {"attack": table(rows)}))
 
 
 if __name__ == "__main__":

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import envs
 from envs.scene import TABLE_HEIGHT, build_scene
-from rmp_mjx import Obstacles, Robot, StopGuard
+from rmp_mjx import RMPVICES, Obstacles, Robot, StopGuard
 from rmp_mjx.control.avoidance import self_gaps
 from rmp_mjx.control.guard import ROUNDING
 from rmp_mjx.robot.bounds import Bounds, centre_levers
@@ -400,3 +401,15 @@ def test_an_unlimited_slide_has_no_bounds(robot):
     slides = (False, *robot.hinge[1:])
     with pytest.raises(ValueError, match="sliding joint"):
         Bounds.of(robot.replace(hinge=slides))
+
+
+def test_a_task_puts_it_behind_its_controller_by_an_option():
+    def guard_of(**options):
+        controller = envs.load("trajectory", **options).controller
+        assert isinstance(controller, RMPVICES)
+        return controller.guard
+
+    found = guard_of(guard=True, obstacles=1, obstacle_speed=0.1, sim_dt=0.01)
+    assert found is not None
+    assert (found.obstacle_speed, found.step) == (0.1, 0.01)
+    assert guard_of() is None
