@@ -14,6 +14,7 @@ from rmp_mjx.metric import Metric, of_fields
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim import PhysicsState, read_contacts
+from rmp_mjx.types import Constant
 
 REVERSAL = 1.0
 """A torque reverses if it changes by more than this one way, then the other [N m]."""
@@ -78,6 +79,9 @@ class Motion(Pytree):
         return Motion(qd, qdd, jerk, jnp.zeros((), bool))
 
 
+ROUNDING = 1e-3
+"""A speed or a rate beyond its limit by less than this share is at the limit."""
+
 LIMIT_MARGIN = 0.1
 """A joint nearer than this to a limit is a joint-limit event [rad] (VICES)."""
 
@@ -115,6 +119,9 @@ class SafetyRecord(Pytree):
     """The same without the hand."""
     obstacle_collision: Bool[Array, ""] = _event("obstacle_collision")
     """A link or the hand touched a sphere."""
+    at_fault: Bool[Array, ""] = _event("at_fault", "at-fault contact", shown=True)
+    """A collision began while the arm's own speed towards the other body was above
+    1 cm/s; the other body's motion does not count (`envs.impacts`)."""
     self_collision: Bool[Array, ""] = _event(
         "self_collision", "self-collision", shown=True
     )
@@ -123,6 +130,11 @@ class SafetyRecord(Pytree):
     """A limited joint within 0.1 rad of its range's end."""
     turn_limit: Bool[Array, ""] = _event("turn_limit")
     """A continuous joint within 0.1 rad of +-2 pi."""
+    joint_velocity: Bool[Array, ""] = _event("joint_velocity")
+    """A joint faster than the robot's `qd_max`, if it has one. It ends no episode."""
+    torque_rate: Bool[Array, ""] = _event("torque_rate")
+    """A torque that changed faster than the robot's `tau_rate_max`, if it has one. It
+    ends no episode."""
     contact_force: Float[Array, ""] = recorded(
         "mean", Metric("contact_force", "mean", unit="N")
     )
@@ -132,6 +144,20 @@ class SafetyRecord(Pytree):
         Metric("contact_force_peak", "max", "contact peak", "N", table=("max",)),
     )
     """Greatest of them on one pair of geoms [N]."""
+    contact_speed: Float[Array, ""] = recorded(
+        "max", Metric("contact_speed", "max", unit="m/s", table=("max",))
+    )
+    """Greatest own speed of the arm towards the other body as a collision began
+    [m/s]."""
+    closing_speed: Float[Array, ""] = recorded(
+        "max", Metric("closing_speed", "max", unit="m/s")
+    )
+    """Greatest speed of the two towards each other as a collision began [m/s]."""
+    contact_energy: Float[Array, ""] = recorded(
+        "max", Metric("contact_energy", "max", unit="J", table=("max",))
+    )
+    """Energy of the arm's own motion along the normal, with the arm's effective mass,
+    of the collision that began with the greatest own speed in a policy step [J]."""
     work_force: Float[Array, ""] = recorded(
         "mean", Metric("work_force", "mean", unit="N", table=("mean",))
     )
@@ -149,10 +175,19 @@ class SafetyRecord(Pytree):
         "max", Metric("torque_jump", "max", unit="N m")
     )
     """Greatest change of a torque from one physics step to the next [N m]."""
+    torque_slope: Float[Array, ""] = recorded(
+        "max", Metric("torque_slope", "max", unit="N m/s")
+    )
+    """Greatest rate of change of a torque from one physics step to the next
+    [N m/s]."""
     torque_reversals: Float[Array, ""] = recorded(
         "mean", Metric("torque_reversals", "mean", unit="share")
     )
     """Share of the physics steps in which a torque reverses, as in an oscillation."""
+    joint_speed: Float[Array, ""] = recorded(
+        "max", Metric("joint_speed", "max", unit="rad/s", table=("max",))
+    )
+    """Greatest speed of a joint [rad/s]."""
     joint_jerk: Float[Array, ""] = recorded(
         "max", Metric("joint_jerk", "max", unit="rad/s^3")
     )
@@ -223,6 +258,7 @@ def observe(
     torques: Torques,
     motion: Motion,
     torque_limit: Float[Array, " n"],
+    change: Float[Array, " n"] | None = None,
 ) -> SafetyRecord:
     """The record of the physics step that led to `state`.
 
@@ -233,7 +269,13 @@ def observe(
         torques: Torques up to this step.
         motion: Velocities up to this step.
         torque_limit: Not 0 where a torque was at its limit, (n,).
+        change: Change of the applied torques in this step, the first of a policy step
+            included, (n,) [N m]; for an arm with a limit on their rate.
+
+    Returns:
+        The record; what is measured of collisions is for `impacts` to add.
     """
+    timestep = scene.model.opt.timestep
     contacts = read_contacts(scene.model, state)
     q = state.qpos[: robot.n]
     near_lower = q - robot.q_lower < LIMIT_MARGIN
@@ -241,6 +283,7 @@ def observe(
     free = ~jnp.isfinite(robot.q_upper) & jnp.asarray(robot.hinge)
     work = jnp.sum(jnp.where(scene.work, contacts.force, 0.0))
     unwanted = jnp.where(scene.work, 0.0, contacts.force)
+    zero = jnp.zeros_like(work)
     return SafetyRecord(
         collision=jnp.any(contacts.touching & (scene.hand | scene.arm)),
         arm_collision=jnp.any(contacts.touching & scene.arm),
@@ -248,13 +291,32 @@ def observe(
         self_collision=jnp.any(contacts.touching & scene.self_pairs),
         joint_limit=jnp.any(near_lower | near_upper),
         turn_limit=jnp.any(free & (jnp.abs(q) > TURN - LIMIT_MARGIN)),
+        at_fault=jnp.zeros((), bool),
+        joint_velocity=_beyond(motion.qd, robot.qd_max),
+        torque_rate=_beyond(
+            None if change is None else change / timestep, robot.tau_rate_max
+        ),
         contact_force=jnp.sum(unwanted),
         contact_force_peak=jnp.max(unwanted, initial=0.0),
+        contact_speed=zero,
+        closing_speed=zero,
+        contact_energy=zero,
         work_force=work,
         work_force_peak=work,
         torque_saturation=jnp.any(torque_limit != 0.0).astype(q.dtype),
         torque_jump=jnp.max(jnp.abs(torques.change)),
+        torque_slope=jnp.max(jnp.abs(torques.change)) / timestep,
         torque_reversals=torques.reversed.astype(q.dtype),
+        joint_speed=jnp.max(jnp.abs(motion.qd)),
         joint_jerk=jnp.max(jnp.abs(motion.jerk)),
         contact_overflow=jnp.any(contacts.overflow),
     )
+
+
+def _beyond(
+    value: Float[Array, " n"] | None, limit: Float[Constant, " n"] | None
+) -> Bool[Array, ""]:
+    """Whether an entry is beyond its limit by more than rounding; no limit: never."""
+    if value is None or limit is None:
+        return jnp.zeros((), bool)
+    return jnp.any(jnp.abs(value) > (1.0 + ROUNDING) * jnp.asarray(limit, value.dtype))

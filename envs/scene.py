@@ -54,6 +54,10 @@ class Scene(Pytree):
     """Pairs of the hand with geoms that it may touch."""
     spheres: int = struct.field(pytree_node=False)
     """Obstacle spheres (mocap bodies, in order)."""
+    capsule: np.ndarray = struct.field(pytree_node=False)
+    """The arm's capsule in each pair of hand or arm; these pairs come first."""
+    other: np.ndarray = struct.field(pytree_node=False)
+    """Id of the other geom in each of them."""
 
 
 def no_objects(spec: mujoco.MjSpec) -> Contacts:
@@ -116,14 +120,17 @@ def build_scene(
         np.repeat(np.arange(4), groups) == i for i in range(4)
     )
     hand = np.concatenate([of_hand, np.zeros(len(self_pairs) + len(work), bool)])
+    model = spec.compile()
     return Scene(
-        model=spec.compile(),
+        model=model,
         hand=hand,
         arm=(is_forbidden | is_sphere) & ~hand,
         obstacle=is_sphere,
         self_pairs=is_self,
         work=is_work,
         spheres=spheres,
+        capsule=np.array([capsules.geom.index(g[len(ARM) :]) for g, *_ in world], int),
+        other=np.array([int(model.geom(x).id) for *_, x in world], int),
     )
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from envs import impacts
 from envs.options import CONTROLLERS, substeps
 from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, build_scene
@@ -239,14 +240,17 @@ class World(Task[OptionsT]):
         setpoint = ctrl.setpoint(data.qpos[:n], ctrl.decode(action), time)
 
         def substep(carry, noise):
-            data, spheres, memory, torques, motion, record = carry
+            data, spheres, memory, torques, motion, touched, record = carry
+            last = memory.tau
             out, memory = self.control(data, spheres, setpoint, memory, error, noise)
+            velocity = spheres.velocity
             if self.options.obstacle_speed and self.scene.spheres:
                 centers, spheres = spheres.move(
                     data.mocap_pos, self.sim_dt, *self.sphere_box
                 )
                 data = data.replace(mocap_pos=centers)
-            data = self.physics.step(data, out.tau)
+            before, data = data, self.physics.step(data, out.tau)
+            touching = impacts.touching(self.scene, data)
             now = observe(
                 self.scene,
                 self.robot,
@@ -254,14 +258,31 @@ class World(Task[OptionsT]):
                 torques := torques.then(out.tau),
                 motion := motion.then(data.qvel[:n], self.sim_dt),
                 out.diagnostics["torque_limit"],
+                None if last is None or memory.tau is None else memory.tau - last,
+            )
+            moment = impacts.Moment(
+                qpos=before.qpos,
+                qvel=before.qvel,
+                centers=before.mocap_pos,
+                velocity=velocity,
+                begun=touching & ~touched,
             )
             record = record.then(now, 1.0 / self.n_substeps)
-            return (data, spheres, memory, torques, motion, record), None
+            parts = torques, motion, touching, record
+            return (data, spheres, memory, *parts), moment
 
-        before = Torques.start(n), Motion.start(data.qvel[:n])
+        touched = impacts.touching(self.scene, data)
+        before = Torques.start(n), Motion.start(data.qvel[:n]), touched
         start = (data, spheres, memory, *before, SafetyRecord.empty())
-        (data, spheres, memory, _, _, record), _ = jax.lax.scan(
+        (data, spheres, memory, _, _, _, record), moments = jax.lax.scan(
             substep, start, self.noise(key), length=self.n_substeps
+        )
+        impact = impacts.measure(self.scene, self.robot, moments)
+        record = record.replace(
+            at_fault=impact.at_fault,
+            contact_speed=impact.own,
+            closing_speed=impact.closing,
+            contact_energy=impact.energy,
         )
         return data, spheres, memory, setpoint, record
 
