@@ -73,13 +73,39 @@ class ArmEnv(World[OptionsT]):
     def _start(self, rng: Array, course: Course) -> State:
         """A start with no more than the curriculum's level of the options' spheres."""
         rng, key_q, key_task, key_spheres, key_motion = jax.random.split(rng, 5)
-        model, n = self.scene.model, self.robot.n
-        q = jnp.asarray(self.robot.q_home, jnp.float32)
-        q = q + self.options.start_noise * jax.random.normal(key_q, (n,))
+        q = self.start_of(jax.random.normal(key_q, (self.robot.n,)))
         objects, task = self.begin(key_task, q)
         centers, spheres = self._spheres(key_spheres, key_motion, course.level, q, task)
+        return self.opening(rng, q, objects, task, centers, spheres, course)
+
+    def start_of(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Start configuration of standard normal numbers [rad]."""
+        q = jnp.asarray(self.robot.q_home, jnp.float32)
+        return q + self.options.start_noise * z
+
+    def opening(
+        self,
+        rng: Array,
+        q: Float[Array, " n"],
+        objects: Float[Array, " o"],
+        task: dict[str, Array],
+        centers: Float[Array, "k 3"],
+        spheres: Spheres,
+        course: Course,
+    ) -> State:
+        """The state before the first step of an episode whose world is given.
+
+        Args:
+            rng: Key of what is random during the episode.
+            q: Joint coordinates of the arm, at rest [rad].
+            objects: Positions of the task's objects, and...
+            task: ...the task's part of the state: what `begin` returns.
+            centers: Centres of the spheres [m].
+            spheres: Their state.
+            course: The curriculum.
+        """
         data = self.physics.init(
-            jnp.concatenate([q, objects]), jnp.zeros(model.nv), centers
+            jnp.concatenate([q, objects]), jnp.zeros(self.scene.model.nv), centers
         )
         return State(
             data=data,

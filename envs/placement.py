@@ -71,16 +71,28 @@ def place_spheres(
     Returns:
         Centres (count, 3), and which of them found a place.
     """
-    rule = LAYOUTS[layout]
-    kind, to_points = rule["points"]
-    to_points = to_points + (radius if kind == "surface" else 0.0)
     centers = jax.random.uniform(rng, (count, CANDIDATES, 3), minval=low, maxval=high)
-    from_points = _distance(centers, points)
-    from_arm = jnp.min(_all_distances(centers, arm_points) - arm_radii, axis=-1)
-    fits = (from_points >= to_points) & (from_arm - radius >= rule["arm"])
+    fits = keeps_clear(centers, radius, layout, points, arm_points, arm_radii)
     first = jnp.argmax(fits, axis=1)
     chosen = jnp.take_along_axis(centers, first[:, None, None], axis=1)[:, 0]
     return chosen, jnp.any(fits, axis=1)
+
+
+def keeps_clear(
+    centers: Float[Array, "*s 3"],
+    radius: float,
+    layout: Layout,
+    points: Float[Array, "v 3"],
+    arm_points: Float[Array, "p 3"],
+    arm_radii: Float[Constant, " p"],
+) -> Bool[Array, "*s"]:
+    """Whether spheres keep the layout's clearances; arguments as of `place_spheres`."""
+    rule = LAYOUTS[layout]
+    kind, to_points = rule["points"]
+    to_points = to_points + (radius if kind == "surface" else 0.0)
+    from_points = _distance(centers, points)
+    from_arm = jnp.min(_all_distances(centers, arm_points) - arm_radii, axis=-1)
+    return (from_points >= to_points) & (from_arm - radius >= rule["arm"])
 
 
 def _all_distances(x: Array, y: Array) -> Array:
