@@ -100,10 +100,11 @@ class _NoCurvature(Barrier):
         return f - m * jnp.minimum(xd, 0.0) ** 2 / gap, m
 
 
-class _Clipped(rmp.RMPVICES):
+class Clipped(rmp.RMPVICES):
     """RMP-VICES that clips each torque separately."""
 
     def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
+        """Torque for one state."""
         out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
         free = resolve(RMP(out.f, out.M), self.regularizer * out.Mq)
         low, high = torque_range(self.robot, tau_last, self.period)
@@ -171,7 +172,7 @@ CONTROLLERS: dict[str, tuple[Make, str]] = {
     "no_floor": (_collision(eps=0.0), "collision leaves without the velocity floor"),
     "no_margin": (_collision(margin=0.0), "collision leaves without a margin"),
     "long_range": (_collision(r=10.0), "collision leaves without a range"),
-    "clipped_torque": (_Clipped, "each torque clipped separately"),
+    "clipped_torque": (Clipped, "each torque clipped separately"),
     "no_self_collision": (
         _no_self_collision,
         "self-collision leaf switched off",

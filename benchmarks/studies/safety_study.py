@@ -33,6 +33,8 @@ SPHERES, RADIUS = 2, 0.05
 
 PARTS = (
     "leaves",
+    "contact",
+    "braking_share",
     "obstacle_relaxation",
     "limit_relaxation",
     "dither",

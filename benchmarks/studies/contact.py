@@ -1,0 +1,240 @@
+"""Trained policies where contact, weak motors and moving spheres matter, part by part.
+
+Each column is a world, each line a controller: the default one, and ones with a part
+taken away. Every cell is a number of whole episodes under the mean action, the same
+starts in every line. Run as
+``python -m benchmarks.contact --json FILE --docs docs/ablation.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import envs
+from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
+from benchmarks.studies.random_policies import Clipped
+from benchmarks.studies.safety_study import ENDING, Group, Study
+from envs.cli import load_config
+from rmp_mjx import RMPVICES, VICES, runtime
+from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx.training.policy import load_policy
+from rmp_mjx.training.stats import clopper_pearson
+
+Figures = dict[str, np.ndarray]
+
+
+class World(NamedTuple):
+    """A column."""
+
+    title: str
+    """Its title in the table."""
+    options: dict[str, Any]
+    """Options of the task."""
+    group: dict[str, Any]
+    """Settings of its group; see `Group`."""
+
+
+WORLDS = {
+    "close": World("two spheres, close", {"obstacles": 4}, {"spheres": 2}),
+    "moving": World("four at 0.2 m/s", {"obstacles": 4}, {"spheres": 4, "speed": 0.2}),
+    "weak": World("half the torque", {"obstacles": 4}, {"spheres": 2, "torque": 0.5}),
+    "large": World("two of 8 cm", {"obstacles": 2, "sphere_radius": 0.08}, {}),
+    "armature": World(
+        "robosuite's armature", {"obstacles": 3, "armature": "robosuite"}, {}
+    ),
+}
+"""The columns by name. Those with the same options share a compiled program."""
+
+
+def _default(ctrl: RMPVICES) -> RMPVICES:
+    return ctrl
+
+
+def _blind(ctrl: RMPVICES) -> RMPVICES:
+    return ctrl.replace(contact=_contact(ctrl, cap=0.0))
+
+
+def _contact(ctrl: RMPVICES, **changes: float) -> Any:
+    assert ctrl.contact is not None
+    return ctrl.contact.replace(**changes)
+
+
+PARTS: dict[str, tuple[str, Callable[[RMPVICES], RMPVICES]]] = {
+    "all": ("all parts", _default),
+    "blind": ("does not feel contacts", _blind),
+    "holding": (
+        "no release",
+        lambda ctrl: ctrl.replace(contact=_contact(ctrl, min_weight=1.0)),
+    ),
+    "late": (
+        "braking range without a look at the motors",
+        lambda ctrl: ctrl.replace(braking_share=np.inf),
+    ),
+    "none": (
+        "none of the three",
+        lambda ctrl: _blind(ctrl).replace(braking_share=np.inf),
+    ),
+}
+"""Controllers by name: what they are in words, and how they are made."""
+
+OTHERS = {
+    "clipped": ("all, but torques clipped instead of the root limited", Clipped),
+    "vices": ("VICES", VICES),
+    "vices_cbf": ("VICES behind the CBF filter", FilteredVICES),
+}
+"""Controllers that need a program of their own."""
+
+
+def judge(figures: Figures) -> Figures:
+    """Success and events of the first episode of each world; (steps, worlds) each."""
+    over = figures["over"].astype(bool)
+    mine = np.cumsum(np.cumsum(over, axis=0) > 0, axis=0) <= 1
+
+    def ever(name: str) -> np.ndarray:
+        return ((figures[name] > 0) & mine).any(axis=0)
+
+    return {
+        "success": ever("success"),
+        "event": np.any([ever(name) for name in ENDING], axis=0),
+        "at_fault": ever("at_fault" if "at_fault" in figures else "collision"),
+    }
+
+
+def rows_of(key: str, judged: Figures) -> list[Row]:
+    """Rates of one cell with exact intervals."""
+    rows = []
+    for name in ("success", "event", "at_fault"):
+        hits, count = int(judged[name].sum()), len(judged[name])
+        low, high = clopper_pearson(hits, count)
+        note = f"{hits} of {count}; 95 % interval {low:.4f}-{high:.4f}"
+        rows.append(Row(f"{key}/{name}", hits / count, "", note))
+    return rows
+
+
+def measure(
+    task: str,
+    path: Path,
+    worlds: list[str],
+    lines: list[str],
+    episodes: int,
+    seed: int,
+    **options: Any,
+) -> list[Row]:
+    """All cells of one task under one policy."""
+    policy, config = load_policy(path), load_config(path)
+    programs: dict[str, list[str]] = {}
+    for name in worlds:
+        programs.setdefault(str(WORLDS[name].options), []).append(name)
+    rows = []
+    for names in programs.values():
+        shared = {"layout": "close", "physics": "mujoco"} | options
+        shared |= WORLDS[names[0]].options
+        sample = envs.load(task, **{"seen_spheres": config.task.seen_spheres} | shared)
+        agent = policy.agent(sample.observation_size, sample.action_size, True)
+        groups = {
+            name: Group("trained", episodes, limit=sample.episode_length, **more)
+            for name, more in ((name, WORLDS[name].group) for name in names)
+        }
+        for kinds in _programs(lines):
+            began = time.perf_counter()
+            controller = "rmp_vices" if kinds[0] in PARTS else OTHERS[kinds[0]][1]
+            if not isinstance(controller, str):
+                controller = controller(sample.robot)
+            study = Study(
+                controller,
+                list(groups.values()),
+                sample.episode_length,
+                task=task,
+                agent=agent,
+                seen_spheres=config.task.seen_spheres,
+                **shared,
+            )
+            for line in kinds:
+                made = study.env.controller
+                if line in PARTS:
+                    assert isinstance(made, RMPVICES)
+                    made = PARTS[line][1](made)
+                found = study.run(made, seed)
+                for name, group in groups.items():
+                    rows += rows_of(f"{task}/{name}/{line}", judge(found[group]))
+            took = time.perf_counter() - began
+            print(f"{task}, {', '.join(names)}, {', '.join(kinds)}: {took:.0f} s")
+    return rows
+
+
+def _programs(lines: list[str]) -> list[list[str]]:
+    """The lines, those together that share a compiled program."""
+    together = [line for line in lines if line in PARTS]
+    alone = [[line] for line in lines if line not in PARTS]
+    return ([together] if together else []) + alone
+
+
+def table(task: str, worlds: list[str], lines: list[str], rows: list[Row]) -> str:
+    """One task as a Markdown table: a line for each controller."""
+    value = {row.key: row.value for row in rows}
+
+    def cell(world: str, line: str) -> str:
+        success, event, fault = (
+            100 * value[f"{task}/{world}/{line}/{name}"]
+            for name in ("success", "event", "at_fault")
+        )
+        return f"{success:.1f}; {event:.1f} ({fault:.1f})"
+
+    words: Mapping[str, Any] = PARTS | OTHERS
+    head = (task, *(WORLDS[name].title for name in worlds))
+    return markdown(head, [(words[n][0], *(cell(w, n) for w in worlds)) for n in lines])
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", nargs="+", default=list(envs.names()))
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS))
+    parser.add_argument("--lines", nargs="+", default=list(PARTS | OTHERS))
+    parser.add_argument("--policies", type=Path, default=ROOT / "pretrained")
+    parser.add_argument("--suffix", default="rmp_vices", help="TASK-SUFFIX.safetensors")
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=4000)
+    parser.add_argument("--observer", default="momentum")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--docs", type=Path)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, print, and write the requested files."""
+    args = parse(argv)
+    runtime.configure()
+    settings = {k: v for k, v in vars(args).items() if k not in ("json", "docs")}
+    rows: list[Row] = []
+    for task in args.tasks:
+        path = args.policies / f"{task}-{args.suffix}.safetensors"
+        rows += measure(
+            task,
+            path,
+            args.worlds,
+            args.lines,
+            args.episodes,
+            args.seed,
+            observer=args.observer,
+        )
+        show(rows, task)
+        if args.json:
+            write_json(args.json, rows, **settings)
+    tables = {
+        f"contact-{t}": table(t, args.worlds, args.lines, rows) for t in args.tasks
+    }
+    for text in tables.values():
+        print(text)
+    if args.docs:
+        args.docs.write_text(insert(args.docs.read_text(), tables))
+
+
+if __name__ == "__main__":
+    main()
