@@ -332,7 +332,7 @@ class AutodiffRMPVICES(rmp.RMPVICES):
             turning = turning_by_contact(site_state(self.robot, arm), Mq, w)
         tree = rmp_vices_tree(
             self.robot,
-            self.leaves.braking(weights["stop_time"]),
+            self.leaves.weighted(setpoint.weights).braking(weights["stop_time"]),
             setpoint,
             obstacles,
             Mq,

@@ -36,8 +36,11 @@ class ArmEnv(World[OptionsT]):
 
     dt = CTRL_DT
     """Seconds per policy step."""
-    action_size = ACTION_SIZE
-    """Entries of an action in [-1, 1]."""
+
+    @property
+    def action_size(self) -> int:
+        """Entries of an action in [-1, 1]."""
+        return getattr(self.controller, "action_size", ACTION_SIZE)
 
     @property
     def episode_length(self) -> int:
@@ -124,7 +127,7 @@ class ArmEnv(World[OptionsT]):
             | ({"course": course} if self.options.obstacle_curriculum else {}),
         )
 
-    def step(self, state: State, action: Float[Array, " 12"]) -> State:
+    def step(self, state: State, action: Float[Array, " m"]) -> State:
         """Hold the action for one policy step and score where it led."""
         options, info = self.options, state.info
         rng, key = jax.random.split(info["rng"])

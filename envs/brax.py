@@ -50,7 +50,7 @@ class BraxTask(Env):
             info={},
         )
 
-    def step(self, state: BraxState, action: Float[Array, " 12"]) -> BraxState:
+    def step(self, state: BraxState, action: Float[Array, " m"]) -> BraxState:
         """One policy step."""
         new = self.task.step(state.pipeline_state, action)  # pyright: ignore[reportArgumentType]
         return dataclasses.replace(

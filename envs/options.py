@@ -54,6 +54,9 @@ class Options:
     """Low-level controller that the policy commands: rmp_vices, vices,
     rmp_vices_literal (the paper's formulas with their signs corrected), osc (vices with
     a fixed impedance), or vices_cbf (vices behind a safety filter)."""
+    leaf_weights: bool = False
+    """The policy also weighs attractor, posture and standoff of the tree: three more
+    entries of an action. For rmp_vices alone."""
     physics: Literal["auto", "mujoco", "mjx", "warp"] = "auto"
     """Physics engine: mujoco (C threads), mjx (JAX), warp (MuJoCo Warp; extra `warp`),
     or auto: mujoco on a CPU, else mjx."""
@@ -123,6 +126,11 @@ class Options:
             if get_origin(hint) is Literal and value not in get_args(hint):
                 raise ValueError(unknown(name, str(value), get_args(hint)))
         substeps(self.sim_dt)
+        if self.leaf_weights and self.controller != "rmp_vices":
+            raise ValueError(
+                "leaf_weights shapes the tree of controller rmp_vices; "
+                f"{self.controller} has none that a policy may shape"
+            )
         for name in _AT_LEAST_ZERO:
             if not getattr(self, name) >= 0:
                 raise ValueError(

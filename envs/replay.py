@@ -28,6 +28,7 @@ from rmp_mjx import runtime
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.rollout import VALUE_LIMIT
 from rmp_mjx.training.runs import run_folder
+from rmp_mjx.trees import named_leaves
 
 SPEED_LIMIT = 1e3
 """Joint speeds beyond this count as bad; so they do in the tasks [rad/s]."""
@@ -76,7 +77,8 @@ def policy_step(
     setpoint = jax.jit(lambda q, a, time: ctrl.setpoint(q, ctrl.decode(a), time))(
         data.qpos[:n], jnp.asarray(action), env.dt * info["step"]
     )
-    yield Moment("set-point", {k: np.asarray(v) for k, v in vars(setpoint).items()})
+    target = named_leaves(setpoint).items()
+    yield Moment("set-point", {k.lstrip("."): np.asarray(v) for k, v in target})
 
     _, key = jax.random.split(info["rng"])
     error = options.obstacle_noise * jax.random.normal(key, (env.scene.spheres, 3))

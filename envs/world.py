@@ -20,7 +20,13 @@ from envs.spheres import Spheres
 from envs.task import OptionsT, Task
 from envs.types import ControlMemory
 from rmp_mjx import sim
-from rmp_mjx.control import RMPVICES, Controller, Leaves, StopGuard
+from rmp_mjx.control import (
+    RMPVICES,
+    Controller,
+    Leaves,
+    StopGuard,
+    WeightedActionRange,
+)
 from rmp_mjx.control.observer import ContactObserver
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
@@ -54,8 +60,14 @@ class World(Task[OptionsT]):
             controller: A controller object instead of the options' named one.
 
         Raises:
-            ValueError: There is an observer, and the controller takes no `tau_ext`.
+            ValueError: There is an observer, and the controller takes no `tau_ext`; or
+                `leaf_weights` is to change a controller object.
         """
+        if options.leaf_weights and controller is not None:
+            raise ValueError(
+                "leaf_weights is for the named controller: give your own one "
+                "action_range=WeightedActionRange()"
+            )
         self.options = options
         self._own = {"arm": robot is not None, "controller": controller is not None}
         self.robot = self._jaco() if robot is None else robot
@@ -84,6 +96,8 @@ class World(Task[OptionsT]):
         controller = controller.replace(period=self.options.sim_dt)
         if self.options.guard:
             controller = controller.replace(guard=self._guard())
+        if self.options.leaf_weights:
+            controller = controller.replace(action_range=WeightedActionRange())
         collision = self.collision_leaves(self.robot)
         if collision and isinstance(controller, RMPVICES):
             default = controller.leaves == Leaves.default(self.robot)
@@ -215,7 +229,7 @@ class World(Task[OptionsT]):
         self,
         data: PhysicsState,
         spheres: Spheres,
-        action: Float[Array, " 12"],
+        action: Float[Array, " m"],
         memory: ControlMemory,
         error: Array | float = 0.0,
         time: Array | float = 0.0,

@@ -10,6 +10,7 @@ from rmp_mjx.control import Leaves as Leaves
 from rmp_mjx.control import OrientationRelaxation as OrientationRelaxation
 from rmp_mjx.control import SetpointDither as SetpointDither
 from rmp_mjx.control import StopGuard as StopGuard
+from rmp_mjx.control import WeightedActionRange as WeightedActionRange
 from rmp_mjx.control import per_link as per_link
 from rmp_mjx.control import rmp_vices_literal as rmp_vices_literal
 from rmp_mjx.obstacles import Obstacles as Obstacles
@@ -28,6 +29,7 @@ from rmp_mjx.robot import RobotError as RobotError
 from rmp_mjx.robot import RobotWarning as RobotWarning
 from rmp_mjx.types import Action as Action
 from rmp_mjx.types import ControlOutput as ControlOutput
+from rmp_mjx.types import LeafWeights as LeafWeights
 from rmp_mjx.types import Setpoint as Setpoint
 
 __version__ = "0.2.0"

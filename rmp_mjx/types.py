@@ -10,6 +10,17 @@ from rmp_mjx.pytree import Constant as Constant
 from rmp_mjx.pytree import Pytree
 
 
+class LeafWeights(Pytree):
+    """How a policy shapes the tree, within bounds (`WeightedActionRange`)."""
+
+    attractor: Float[Constant, ""]
+    """Factor on the metric of the impedance attractors, at most 1."""
+    posture: Float[Constant, ""]
+    """Factor on the metric of the posture."""
+    standoff: Float[Constant, ""]
+    """Added to the margins of the leaves that avoid obstacles, at least 0 [m]."""
+
+
 class Action(Pytree):
     """One variable-impedance action in physical units (VICES action space)."""
 
@@ -21,6 +32,8 @@ class Action(Pytree):
     """Mass-normalised translational stiffness per world axis [1/s^2]."""
     kp_ori: Float[Constant, " 3"]
     """Mass-normalised rotational stiffness per world axis [1/s^2]."""
+    weights: LeafWeights | None = None
+    """Weights of the tree's leaves; None: as the controller has them."""
 
 
 class Setpoint(Pytree):
@@ -37,6 +50,8 @@ class Setpoint(Pytree):
     time: Float[Constant, ""] | float
     """Time of the policy step since the start of the episode [s]. It is the phase of
     `SetpointDither`, which stands still if the time does."""
+    weights: LeafWeights | None = None
+    """Weights of the tree's leaves; None: as the controller has them."""
 
 
 class ControlOutput(Pytree):

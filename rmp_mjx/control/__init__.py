@@ -2,6 +2,7 @@
 
 from rmp_mjx.control.action import ACTION_SIZE as ACTION_SIZE
 from rmp_mjx.control.action import ActionRange as ActionRange
+from rmp_mjx.control.action import WeightedActionRange as WeightedActionRange
 from rmp_mjx.control.avoidance import per_link as per_link
 from rmp_mjx.control.controller import Controller as Controller
 from rmp_mjx.control.dither import SetpointDither as SetpointDither

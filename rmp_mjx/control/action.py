@@ -1,4 +1,4 @@
-"""From a policy's action in [-1, 1]^12 to physical units, and to a set-point."""
+"""From a policy's action in [-1, 1]^m to physical units, and to a set-point."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from rmp_mjx.control.arguments import check
 from rmp_mjx.math import exp_so3
 from rmp_mjx.pytree import Constant, Pytree
-from rmp_mjx.types import Action, Setpoint
+from rmp_mjx.types import Action, LeafWeights, Setpoint
 
 ACTION_SIZE = 12
 """dpos (3), drot (3), kp_pos (3), kp_ori (3), in this order."""
@@ -26,25 +26,88 @@ class ActionRange(Pytree):
     kp_max: Float[Constant, ""] | float = 300.0
     """Greatest stiffness [1/s^2]."""
 
-    def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
-        """Map [-1, 1]^12 to physical units; values outside are clipped.
+    @property
+    def size(self) -> int:
+        """Entries of an action."""
+        return ACTION_SIZE
+
+    def decode(self, action: Float[ArrayLike, " m"]) -> Action:
+        """Map [-1, 1]^m to physical units; values outside are clipped.
 
         A non-finite entry counts as zero: no displacement, middle stiffness.
 
         Raises:
             ValueError: The action has another shape or no floats.
         """
-        check("action", action, (ACTION_SIZE,))
-        action = jnp.asarray(action)
-        u = jnp.clip(jnp.where(jnp.isfinite(action), action, 0.0), -1.0, 1.0)
+        u = self._clipped(action)
         ratio = self.kp_max / jnp.asarray(self.kp_min, u.dtype)
-        kp = self.kp_min * ratio ** (0.5 * (u[6:] + 1.0))
+        kp = self.kp_min * ratio ** (0.5 * (u[6:ACTION_SIZE] + 1.0))
         return Action(
             dpos=self.dpos * u[:3],
             drot=self.drot * u[3:6],
             kp_pos=kp[:3],
             kp_ori=kp[3:],
         )
+
+    def _clipped(self, action: Float[ArrayLike, " m"]) -> Float[Array, " m"]:
+        check("action", action, (self.size,))
+        action = jnp.asarray(action)
+        return jnp.clip(jnp.where(jnp.isfinite(action), action, 0.0), -1.0, 1.0)
+
+
+class WeightedActionRange(ActionRange):
+    r"""A range with three more entries, by which a policy weighs the tree's leaves.
+
+    The safety leaves keep what they can promise, whatever the policy does: their
+    metrics stay as they are, and the others stay light beside them. A safety leaf that
+    asks for the acceleration a along g, with metric m, gets
+
+    $$
+    g \cdot \ddot q - a = \frac{g \cdot \ddot q_0 - a}{1 + m\, g \cdot H^{-1} g},
+    $$
+
+    where $\ddot q_0$ is what the root gives without it and H the rest of its metric
+    (Sherman and Morrison). The heavier H, the more is missing.
+
+    * *Attractor*, $10^{u}$ for u < 0, else 1: never heavier than in the tree that the
+      safety leaves were tuned for.
+    * *Posture*, $10^u$: at most 0.2 of the inertia, less than half of what an attractor
+      weighs.
+    * *Standoff*, 3 cm times u for u > 0, else 0: margins only ever get wider. It may
+      grow at once: the push out of a margin fades as the body leaves
+      (`Barrier.v_out`), so an arm that stands within the new margin is not thrown out.
+
+    With all three entries zero, or not finite, the tree is as without them.
+    docs/controller.md has figures.
+
+    Source: Li et al., "RMPfusion" (2019): a policy's weights on the leaves of a tree.
+    """
+
+    attractor_least: Float[Constant, ""] | float = 0.1
+    """Least factor on the attractors' metric."""
+    posture_most: Float[Constant, ""] | float = 10.0
+    """Greatest factor on the posture's metric; its inverse is the least."""
+    standoff_most: Float[Constant, ""] | float = 0.03
+    """Greatest addition to a margin [m]."""
+
+    @property
+    def size(self) -> int:
+        """Entries of an action: attractor, posture and standoff come last."""
+        return ACTION_SIZE + 3
+
+    def decode(self, action: Float[ArrayLike, " m"]) -> Action:
+        """Map [-1, 1]^15 to physical units, as `ActionRange.decode`."""
+        attractor, posture, standoff = self._clipped(action)[ACTION_SIZE:]
+        least, most = (
+            jnp.asarray(x, attractor.dtype)
+            for x in (self.attractor_least, self.posture_most)
+        )
+        weights = LeafWeights(
+            attractor=least ** jnp.maximum(-attractor, 0.0),
+            posture=most**posture,
+            standoff=self.standoff_most * jnp.maximum(standoff, 0.0),
+        )
+        return super().decode(action).replace(weights=weights)
 
 
 def compose_setpoint(
@@ -67,4 +130,5 @@ def compose_setpoint(
         kp_pos=action.kp_pos,
         kp_ori=action.kp_ori,
         time=jnp.asarray(time, p.dtype),
+        weights=action.weights,
     )

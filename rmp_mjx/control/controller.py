@@ -29,8 +29,11 @@ class Controller(Protocol):
     what the call takes: they are `Action` and `Setpoint` for the controllers here.
     """
 
-    def decode(self, action: Float[Array, " 12"]) -> Any:
-        """Physical units of a policy's action in [-1, 1]^12."""
+    def decode(self, action: Float[Array, " m"]) -> Any:
+        """Physical units of a policy's action in [-1, 1]^m, m = 12 if not else said.
+
+        A controller that takes another number has the property `action_size`.
+        """
         ...
 
     def setpoint(self, q: Float[Array, " n"], action: Any, time: Any) -> Any:
@@ -61,15 +64,20 @@ class ImpedanceController(Pytree):
     robot: Robot
     """The arm."""
     action_range: ActionRange = struct.field(default_factory=ActionRange, kw_only=True)
-    """Physical meaning of a policy action in [-1, 1]^12."""
+    """Physical meaning of a policy action in [-1, 1]^m."""
     period: Float[Constant, ""] | float = struct.field(default=0.005, kw_only=True)
     """Time between two calls [s], for the limits of speed and torque rate."""
     guard: StopGuard | None = struct.field(default=None, kw_only=True)
     """Sends a torque only if the arm can stop after it, see `StopGuard`; None: off. Its
     diagnostics join the controller's."""
 
-    def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
-        """Physical units of a policy's action in [-1, 1]^12, (12,).
+    @property
+    def action_size(self) -> int:
+        """Entries m of a policy's action."""
+        return self.action_range.size
+
+    def decode(self, action: Float[ArrayLike, " m"]) -> Action:
+        """Physical units of a policy's action in [-1, 1]^m, (m,).
 
         Raises:
             ValueError: The action has another shape or no floats.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from jaxtyping import Array, Float
 
@@ -14,6 +15,7 @@ from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from rmp_mjx.rmp.leaves.posture import Posture, soft_posture
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.shapes import KINDS
+from rmp_mjx.types import LeafWeights
 
 CollisionLeaf = ScalarLeaf | Mapping[str, ScalarLeaf | None]
 """A leaf for all obstacles, or one for each kind by name (None: not avoided)."""
@@ -62,21 +64,29 @@ class Leaves(Pytree):
             posture=soft_posture(robot.q_home),
         )
 
+    def weighted(self, weights: LeafWeights | None) -> Leaves:
+        """The leaves with a policy's weights; None: unchanged."""
+        if weights is None:
+            return self
+
+        def wider(leaf: ScalarLeaf) -> ScalarLeaf:
+            return leaf.standing_off(weights.standoff)
+
+        posture = self.posture
+        if posture is not None:
+            posture = posture.replace(weight=posture.weight * weights.posture)
+        return self.replace(collision=_each(wider, self.collision), posture=posture)
+
     def braking(self, stop_time: Float[Array, ""] | float) -> Leaves:
         """The leaves of an arm that needs this time to stop [s]."""
 
-        def slowed(leaf: ScalarLeaf | None) -> ScalarLeaf | None:
-            return None if leaf is None else leaf.braking(stop_time)
+        def slowed(leaf: ScalarLeaf) -> ScalarLeaf:
+            return leaf.braking(stop_time)
 
-        collision = self.collision
-        if isinstance(collision, Mapping):
-            collision = {kind: slowed(leaf) for kind, leaf in collision.items()}
-        else:
-            collision = slowed(collision)
         return self.replace(
-            collision=collision,
-            self_collision=slowed(self.self_collision),
-            joint_limit=slowed(self.joint_limit),
+            collision=_each(slowed, self.collision),
+            self_collision=_each(slowed, self.self_collision),
+            joint_limit=_each(slowed, self.joint_limit),
         )
 
     def with_collision(self, collision: CollisionLeaf | None) -> Leaves:
@@ -93,6 +103,15 @@ class Leaves(Pytree):
             present = {kind: leaf_of(self.collision, kind) for kind in KINDS.values()}
             collision = present | dict(collision)
         return self.replace(collision=collision)
+
+
+def _each(
+    change: Callable[[ScalarLeaf], ScalarLeaf], leaf: CollisionLeaf | None
+) -> Any:
+    """A changed leaf, or those of each kind; None stays None."""
+    if isinstance(leaf, Mapping):
+        return {kind: _each(change, own) for kind, own in leaf.items()}
+    return None if leaf is None else change(leaf)
 
 
 def leaf_of(leaf: CollisionLeaf | None, kind: str) -> ScalarLeaf | None:

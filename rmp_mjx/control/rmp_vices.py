@@ -122,7 +122,8 @@ class RMPVICES(ImpedanceController):
         arm = arm_state(self.robot, q, qd)
         Mq, bias = dynamics(self.robot, arm)
         w = self._by_contact(Mq, tau_ext)
-        slowing, stop = self._braking(Mq, bias, qd, tau_ext)
+        leaves = self.leaves.weighted(setpoint.weights)
+        slowing, stop = self._braking(leaves, Mq, bias, qd, tau_ext)
         branches, around = self._avoidance(slowing, arm, obstacles, w)
         clearance, body_clearance = _nearest(around, arm.p.dtype)
         site = site_state(self.robot, arm)
@@ -131,9 +132,11 @@ class RMPVICES(ImpedanceController):
             setpoint = setpoint.replace(p_des=setpoint.p_des + moved)
         orientation_weight = self._orientation_weight(q, body_clearance)
         attractor_weight = jnp.ones_like(clearance)
+        if setpoint.weights is not None:
+            attractor_weight = attractor_weight * setpoint.weights.attractor
         turning = jnp.zeros(3, arm.p.dtype)
         if self.contact is not None and w is not None:
-            attractor_weight = self.contact.attractor_weight(around.pressed)
+            attractor_weight *= self.contact.attractor_weight(around.pressed)
             turning = turning_by_contact(site, Mq, w)
         branches += self._impedance(
             site, setpoint, attractor_weight, orientation_weight, turning
@@ -205,6 +208,7 @@ class RMPVICES(ImpedanceController):
 
     def _braking(
         self,
+        leaves: Leaves,
         Mq: Float[Array, "n n"],
         bias: Float[Array, " n"],
         qd: Float[Array, " n"],
@@ -212,11 +216,11 @@ class RMPVICES(ImpedanceController):
     ) -> tuple[Leaves, Float[Array, ""]]:
         """The leaves for an arm that needs some time to stop, and that time [s]."""
         if self.braking_share is None:
-            return self.leaves, jnp.zeros((), Mq.dtype)
+            return leaves, jnp.zeros((), Mq.dtype)
         load = bias if tau_ext is None or self.contact is None else bias - tau_ext
         tau_max = jnp.asarray(self.robot.tau_max)
         time = stop_time(Mq, load, qd, tau_max, self.braking_share)
-        return self.leaves.braking(time), time
+        return leaves.braking(time), time
 
     def _impedance(
         self,

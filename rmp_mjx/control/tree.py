@@ -38,7 +38,8 @@ def rmp_vices_tree(
 
     Args:
         robot: The arm.
-        leaves: All leaves but the attractors, with the time to stop in this state.
+        leaves: All leaves but the attractors, with the policy's weights and the time to
+            stop in this state.
         setpoint: Impedance target, the dither included.
         obstacles: Obstacle slots.
         Mq: Inertia, the metric of the posture leaf.

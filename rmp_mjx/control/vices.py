@@ -107,8 +107,8 @@ class OSC(VICES):
     kp: Float[Constant, ""] | float = 150.0
     """Stiffness in every direction [1/s^2]."""
 
-    def decode(self, action: Float[ArrayLike, " 12"]) -> Action:
-        """Physical units of a policy action in [-1, 1]^12."""
+    def decode(self, action: Float[ArrayLike, " m"]) -> Action:
+        """Physical units of a policy action in [-1, 1]^m."""
         free = super().decode(action)
         held = jnp.full_like(free.kp_pos, self.kp)
         return free.replace(kp_pos=held, kp_ori=held)

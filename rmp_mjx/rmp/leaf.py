@@ -57,6 +57,14 @@ class ScalarLeaf(Leaf):
         del stop_time
         return self
 
+    def standing_off(self, distance: Float[Array, ""] | float) -> ScalarLeaf:
+        """The leaf with a margin that is wider by a distance.
+
+        A leaf takes no notice, unless it has a margin.
+        """
+        del distance
+        return self
+
     @abc.abstractmethod
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]

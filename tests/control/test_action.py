@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from rmp_mjx import Action, ActionRange
+from rmp_mjx import Action, ActionRange, WeightedActionRange
 from rmp_mjx.control.action import compose_setpoint
 from rmp_mjx.math import exp_so3
 
@@ -85,3 +87,46 @@ def test_setpoint_displaces_the_pose_in_the_world_frame():
     np.testing.assert_array_equal(setpoint.kp_pos, kp)
     np.testing.assert_array_equal(setpoint.kp_ori, 2 * kp)
     assert setpoint.time == np.float32(0.7)
+
+
+WEIGHTED = WeightedActionRange()
+entry = st.floats(width=32)  # infinite and not-a-number, too
+
+
+@settings(deadline=None)
+@given(entries=st.lists(entry, min_size=3, max_size=3))
+def test_no_policy_weighs_the_leaves_beyond_their_bounds(entries):
+    """1e-6 relative: powers in float32."""
+    action = jnp.concatenate([jnp.full(12, 0.3), jnp.asarray(entries, jnp.float32)])
+    weights = WEIGHTED.decode(action).weights
+    assert weights is not None
+    assert 0.1 * (1 - 1e-6) <= float(weights.attractor) <= 1.0
+    assert 0.1 * (1 - 1e-6) <= float(weights.posture) <= 10.0 * (1 + 1e-6)
+    assert 0.0 <= float(weights.standoff) <= 0.03 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("u", "attractor", "posture", "standoff"),
+    [
+        (-1.0, 0.1, 0.1, 0.0),
+        (-0.5, 10**-0.5, 10**-0.5, 0.0),
+        (0.0, 1.0, 1.0, 0.0),
+        (0.5, 1.0, 10**0.5, 0.015),
+        (1.0, 1.0, 10.0, 0.03),
+        (np.nan, 1.0, 1.0, 0.0),
+    ],
+)
+def test_the_last_entries_weigh_the_leaves(u, attractor, posture, standoff):
+    action = WEIGHTED.decode(jnp.full(15, 0.3).at[12:].set(u))
+    found = jnp.stack(jax.tree.leaves(action.weights))
+    np.testing.assert_allclose(found, [attractor, posture, standoff], rtol=1e-6)
+    plain = RANGE.decode(jnp.full(12, 0.3))
+    assert plain.weights is None
+    assert action.replace(weights=None) == plain
+
+
+def test_an_action_of_the_other_size_is_refused():
+    assert (RANGE.size, WEIGHTED.size) == (12, 15)
+    for kind in (RANGE, WEIGHTED):
+        with pytest.raises(ValueError, match=rf"shape \({kind.size},\)"):
+            kind.decode(jnp.zeros(27 - kind.size))

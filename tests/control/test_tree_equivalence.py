@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks.common import AutodiffRMPVICES
-from rmp_mjx import RMPVICES, Leaves, Node, Siblings, per_link
+from rmp_mjx import RMPVICES, Leaves, Node, Siblings, WeightedActionRange, per_link
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import arm_state
+from rmp_mjx.robot.kinematics import arm_state, point_positions, site_state
 from tests.control.conftest import QUICK
 
 quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
@@ -75,6 +75,113 @@ def test_closed_form_is_the_autodiff_tree_in_contact(run64, robot, inputs, push)
         scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
         assert np.max(np.abs(a - b) / scale) < tolerance, name
         assert np.max(np.abs(a - c) / scale) > 1e-3, name
+
+
+def with_weights(inputs, entries):
+    """The inputs with three more entries in every action."""
+    q, qd, action, obstacles = inputs
+    entries = np.broadcast_to(entries, (len(q), 3))
+    return q, qd, np.concatenate([action, entries], axis=1), obstacles
+
+
+@pytest.fixture(scope="module")
+def weighted(robot):
+    return RMPVICES(robot, action_range=WeightedActionRange())
+
+
+def test_a_policys_weights_are_those_of_the_autodiff_tree(
+    run64, robot, inputs, varied, weighted
+):
+    """The tolerances of `test_closed_form_is_the_autodiff_tree`."""
+    leaves = Leaves.default(robot).with_collision(varied)
+    entries = np.random.default_rng(5).uniform(-1.0, 1.0, (len(inputs[0]), 3))
+    args = with_weights(inputs, entries)
+    fast = run64(weighted.replace(leaves=leaves), *args)
+    kind = AutodiffRMPVICES(robot, leaves, action_range=WeightedActionRange())
+    slow = run64(kind, *args)
+    for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("tau", 1e-7)):
+        a, b = (getattr(out, name).reshape(len(inputs[0]), -1) for out in (fast, slow))
+        scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
+        assert np.max(np.abs(a - b) / scale) < tolerance, name
+
+
+def test_a_policy_that_weighs_nothing_has_the_default_tree(
+    run64, inputs, fast, weighted
+):
+    """To rounding: multiplications by 1 and additions of 0."""
+    out = run64(weighted, *with_weights(inputs, 0.0))
+    for name in ("f", "M"):
+        a, b = getattr(out, name), getattr(fast, name)
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-9 * np.abs(b).max())
+
+
+def test_a_policys_weights_leave_the_safety_leaves_on_top(run64, inputs, weighted):
+    r"""The bound of `WeightedActionRange`: what is not a safety leaf stays light.
+
+    With standoff 0 the metrics of any two choices differ by attractors and posture
+    alone. Between the extremes every metric is ordered (positive semidefinite up to
+    rounding, 1e-9 of the largest entry), and no choice is heavier than the default by
+    more than nine times the posture, at most 0.18 of the inertia.
+    """
+
+    def metric(*entries):
+        return run64(weighted, *with_weights(inputs, np.array(entries)))
+
+    default, heavy, light = metric(0, 0, 0), metric(1, 1, 0), metric(-1, -1, 0)
+    some = metric(-0.4, 0.7, 0)
+    scale = np.abs(default.M).max(axis=(1, 2))
+
+    def ordered(above, below):
+        assert np.all(np.linalg.eigvalsh(above - below)[:, 0] > -1e-9 * scale)
+
+    for one in (default, some):
+        ordered(heavy.M, one.M)
+        ordered(one.M, light.M)
+    ordered(default.M + 0.18 * default.Mq, heavy.M)
+    # A standoff only adds to the metrics of bodies that are not yet at the cap.
+    wide = metric(0, 0, 1)
+    assert np.mean(np.trace(wide.M - default.M, axis1=1, axis2=2) > 0.0) > 0.5
+
+
+def test_the_heaviest_posture_takes_little_from_a_safety_leaf_at_its_cap(ctrl):
+    """The table of docs/controller.md: shares that are missing, by link.
+
+    Pushes in random directions on all control points, 300 poses about home.
+    """
+    robot, rng = ctrl.robot, np.random.default_rng(0)
+    q = robot.q_home + rng.uniform(-0.8, 0.8, (300, 7))
+
+    @quick_jit
+    @jax.vmap
+    def parts(q):
+        arm = arm_state(robot, q, jnp.zeros(7))
+        site, (Mq, _) = site_state(robot, arm), dynamics(robot, arm)
+        J = jax.jacfwd(lambda q: point_positions(robot, q))(q)
+        return J, site.J_pos.T @ site.J_pos, site.J_ori.T @ site.J_ori, Mq
+
+    with jax.enable_x64(True):
+        J, position, orientation, Mq = jax.device_get(parts(q))
+    n = rng.normal(size=J.shape[:3])
+    g = np.einsum("bpi,bpij->bpj", n / np.linalg.norm(n, axis=2, keepdims=True), J)
+    segment = np.array(robot.points.segment)
+
+    def missing(link, attractor, posture, percentile):
+        H = attractor * (position + 1e-3 * orientation)
+        H += (0.02 * posture + ctrl.regularizer) * Mq
+        solved = np.linalg.solve(H, np.swapaxes(g, 1, 2))
+        share = 1.0 / (1.0 + 1e3 * np.einsum("bpj,bjp->bp", g, solved))
+        return np.percentile(share[:, segment == link], percentile)
+
+    table = {
+        (1.0, 1.0): [(5e-4, 0.05), (2e-4, 1e-3), (1e-3, 1e-3)],
+        (0.1, 1.0): [(3e-4, 0.03), (2e-4, 5e-4), (2e-4, 4e-4)],
+        (1.0, 10.0): [(3e-3, 0.24), (1e-3, 4e-3), (2e-3, 3e-3)],
+    }
+    for (attractor, posture), row in table.items():
+        for link, shares in zip((2, 4, 6), row, strict=True):
+            found = [missing(link, attractor, posture, p) for p in (50, 99)]
+            # as rounded there, and other poses may be drawn
+            np.testing.assert_allclose(found, shares, rtol=0.5)
 
 
 def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):

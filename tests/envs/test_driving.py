@@ -36,11 +36,16 @@ def start(quiet, arm):
     return quiet.replace(data=data, info=info)
 
 
-def drive(task, state):
-    """Metrics of every step, (STEPS, LANES) each, and the last state."""
-    rows = []
+def drive(task, state, more=0):
+    """Metrics of every step, (STEPS, LANES) each, and the last state.
+
+    With `more` the action has so many random entries besides, new ones in every step.
+    """
+    rows, rng = [], np.random.default_rng(0)
     for _ in range(STEPS):
-        state = task.step(state, jnp.asarray(ACTION))
+        entries = np.sign(rng.uniform(-1.0, 1.0, (LANES, more)))
+        action = np.concatenate([ACTION, entries.astype(np.float32)], axis=1)
+        state = task.step(state, jnp.asarray(action))
         rows.append(state.metrics)
     return jax.tree.map(lambda *x: np.stack(x), *rows), state
 
@@ -63,8 +68,15 @@ def test_vices_runs_into_everything(vices):
     assert metrics["contact_force_peak"][:, [TABLE, SPHERE]].max(axis=0).min() > 10.0
 
 
-def test_rmp_vices_runs_into_nothing(rmp_vices):
-    metrics, _ = rmp_vices
+@pytest.fixture(scope="module")
+def weighing(make, start):
+    return drive(make("rmp_vices", leaf_weights=True), start, more=3)
+
+
+@pytest.mark.parametrize("which", ["rmp_vices", "weighing"])
+def test_rmp_vices_runs_into_nothing(which, request):
+    """Nor does it if the policy weighs its leaves as wildly as it may."""
+    metrics, _ = request.getfixturevalue(which)
     for name in ("collision", "self_collision", "joint_limit", "contact_force_peak"):
         assert not np.any(metrics[name]), name
 

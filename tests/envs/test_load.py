@@ -2,6 +2,8 @@
 
 from typing import Any, get_args, get_type_hints
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -28,6 +30,7 @@ def test_an_unknown_task_lists_the_tasks_and_suggests_one():
         ({"layout": "near"}, "'near'.*far, close"),
         ({"observation": "image"}, "'image'.*rotated, fixed"),
         ({"armature": "none"}, "'none'.*physical, robosuite"),
+        ({"controller": "vices", "leaf_weights": True}, "leaf_weights.* rmp_vices; v"),
         ({"obstacles": -1}, "obstacles must be at least 0"),
         ({"sphere_radius": 0.0}, "sphere_radius must be positive"),
         ({"sim_dt": 0.004}, "0.004 s does not divide the policy step of 0.05 s"),
@@ -55,6 +58,19 @@ def test_the_names_that_options_take_are_the_names_that_exist():
     assert get_args(get_type_hints(DoorOptions)["variant"]) == tuple(VARIANTS)
     for name in get_args(kind["armature"]):
         Robot.load("jaco2", armature=name)
+
+
+def test_leaf_weights_are_three_more_entries_of_an_action():
+    for name in envs.names():
+        env = envs.load(name, physics="mujoco", leaf_weights=True)
+        assert env.action_size == 15
+        start = jax.eval_shape(env.reset, jax.random.key(0))
+        jax.eval_shape(env.step, start, jnp.zeros(15))
+    env = envs.load("push", physics="mujoco", leaf_weights=True)
+    own = RMPVICES(env.robot)
+    with pytest.raises(ValueError, match="action_range=WeightedActionRange"):
+        envs.load("push", physics="mujoco", leaf_weights=True, controller=own)
+    assert envs.load("push", physics="mujoco", controller=env.controller).action_size
 
 
 def test_options_are_the_same_by_name_and_made_by_hand():

@@ -60,6 +60,10 @@ class Barrier(ScalarLeaf):
         """The barrier for an arm that needs this time to stop [s]."""
         return self.replace(stop_time=stop_time)
 
+    def standing_off(self, distance: Float[Array, ""] | float) -> Barrier:
+        """The barrier with a margin that is wider by a distance."""
+        return self.replace(margin=self.margin + distance)
+
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
     ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:

@@ -43,6 +43,10 @@ class PaperCollision(ScalarLeaf):
     cap: Param = 1e5
     """Largest metric."""
 
+    def standing_off(self, distance: Float[Array, ""] | float) -> PaperCollision:
+        """The leaf with a margin that is wider by a distance."""
+        return self.replace(margin=self.margin + distance)
+
     def scalar(
         self, x: Float[Array, "*s"], xd: Float[Array, "*s"]
     ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
