@@ -89,6 +89,11 @@ class PPOConfig:
     """Hidden layers of the policy and of the value network (tanh)."""
     init_log_std: float = -0.5
     """Initial log standard deviation of the policy's actions."""
+    final_log_std: float | None = None
+    """Greatest log standard deviation of the actions after `anneal_steps`; the bound
+    falls to it over their last third, from `init_log_std`. None: no bound."""
+    anneal_steps: int = 1_500_000
+    """Policy steps of an agent after which `final_log_std` holds."""
     reward_scaling: float = 1e-3
     """Factor on the rewards, for trainer brax: ours scales value targets by itself."""
 
@@ -106,6 +111,7 @@ class PPOConfig:
             "num_minibatches",
             "num_groups",
             "num_updates_per_batch",
+            "anneal_steps",
         )
         _positive(
             self,
@@ -237,6 +243,8 @@ class TrainConfig(Generic[AnyTask]):
             raise ConfigError("trainer brax cannot resume a run")
         if self.trainer == "brax" and self.ppo.num_seeds > 1:
             raise ConfigError("trainer brax trains one seed: leave num_seeds out")
+        if self.trainer == "brax" and self.ppo.final_log_std is not None:
+            raise ConfigError("trainer brax has no final_log_std: leave it out")
         if self.trainer == "brax" and self.ppo.num_envs % self.ppo.num_minibatches:
             raise ConfigError(
                 "trainer brax divides environments into minibatches: num_envs = "

@@ -15,6 +15,9 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 Agent = Callable[[Float[Array, "b n"], PRNGKeyArray], Float[Array, "b m"]]
 """Observations and a key to actions in [-1, 1], both batched."""
 
+LOG_STD = "log_value"
+"""Name of the policy's log standard deviations among its parameters, Brax's."""
+
 OBS_LIMIT = 10.0
 """Normalised observations are clipped to this many standard deviations."""
 
@@ -73,6 +76,15 @@ def distribution(networks: ppo_networks.PPONetworks, logits: Float[Array, "*b k"
     """
     made: Any = networks.parametric_action_distribution.create_dist(logits)
     return made
+
+
+def bounded(policy: Any, most: Float[Array, ""]) -> Any:
+    """Policy parameters with no log standard deviation above a bound."""
+
+    def bound(path, leaf):
+        return jnp.minimum(leaf, most) if path[-1].key == LOG_STD else leaf
+
+    return jax.tree_util.tree_map_with_path(bound, policy)
 
 
 def sample_action(

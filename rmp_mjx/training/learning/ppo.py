@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.networks import PPONetworks
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning import devices, rollout, value_scale
@@ -33,6 +33,7 @@ from rmp_mjx.training.learning.learner import (
     make_optimizers,
 )
 from rmp_mjx.training.learning.networks import (
+    bounded,
     distribution,
     make_networks,
     sample_action,
@@ -129,6 +130,7 @@ class PPO:
         learner, learned = update(
             learner, state.normalizer, batch, key_learn, state.iteration > 0
         )
+        learner = self.annealed(learner, state.iteration + 1)
         std = self.action_std(state.normalizer, learner, data.obs[0, :1])
         normalizer = running_statistics.update(
             state.normalizer, data.obs, weights=data.weight, std_min_value=MIN_OBS_STD
@@ -141,6 +143,16 @@ class PPO:
             iteration=state.iteration + 1,
         )
         return state, metrics | learned | {"action_std": std}
+
+    def annealed(self, learner: Learner, iterations: Int[Array, ""]) -> Learner:
+        """The learner with its actions' deviation bounded, see `final_log_std`."""
+        first, last = self.config.init_log_std, self.config.final_log_std
+        if last is None:
+            return learner
+        share = iterations * self.config.steps_per_iteration / self.config.anneal_steps
+        fallen = jnp.clip(3.0 * share - 2.0, 0.0, 1.0)
+        most = jnp.where(fallen > 0.0, first + fallen * (last - first), jnp.inf)
+        return learner.replace(policy=bounded(learner.policy, most))
 
     def iterate(
         self, state: TrainState

@@ -1,5 +1,6 @@
 """PPO on toy tasks, each isolating one fault; and its guards."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -33,8 +34,8 @@ def action(ppo, state, obs):
 class Trained:
     """A few iterations on a toy task, and what they learned."""
 
-    def __init__(self, env, iterations):
-        self.ppo = make_ppo(env, CONFIG)
+    def __init__(self, env, iterations, config=CONFIG):
+        self.ppo = make_ppo(env, config)
         state = jax.jit(self.ppo.init)(jax.random.key(0))
         iterate: Any = jax.jit(self.ppo.iterate)
         self.history = []
@@ -111,3 +112,14 @@ def test_seeds_are_a_batch_axis_and_the_action_depends_on_the_observation():
         state = jax.tree.map(lambda x, seed=seed: x[seed], states)
         assert action(ppo, state, 1.0) == pytest.approx(0.5, abs=0.15)
         assert action(ppo, state, -1.0) == pytest.approx(-0.5, abs=0.15)
+
+
+def test_the_noise_of_the_actions_falls_as_it_is_told():
+    """Over the last third of six iterations, from the first deviation to the last."""
+    steps = 6 * CONFIG.steps_per_iteration
+    config = dataclasses.replace(CONFIG, final_log_std=-2.0, anneal_steps=steps)
+    std = [h["action_std"] for h in Trained(toys.ActionChoice(), 8, config).history]
+    free = [h["action_std"] for h in Trained(toys.ActionChoice(), 8).history]
+    np.testing.assert_array_equal(std[:4], free[:4])
+    assert std[4] <= np.exp(-1.25) * (1 + 1e-6) < free[4]
+    assert max(std[5:]) <= np.exp(-2.0) * (1 + 1e-6)
