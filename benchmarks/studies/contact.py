@@ -97,11 +97,11 @@ def judge(figures: Figures) -> Figures:
     mine = np.cumsum(np.cumsum(over, axis=0) > 0, axis=0) <= 1
 
     def ever(name: str) -> np.ndarray:
-        return ((figures[name] > 0) & mine).any(axis=0)
+        return np.asarray(((figures[name] > 0) & mine).any(axis=0))
 
     return {
         "success": ever("success"),
-        "event": np.any([ever(name) for name in ENDING], axis=0),
+        "event": np.any(np.stack([ever(name) for name in ENDING]), axis=0),
         "at_fault": ever("at_fault" if "at_fault" in figures else "collision"),
     }
 
@@ -124,7 +124,7 @@ def measure(
     lines: list[str],
     episodes: int,
     seed: int,
-    **options: Any,
+    observer: str,
 ) -> list[Row]:
     """All cells of one task under one policy."""
     policy, config = load_policy(path), load_config(path)
@@ -133,9 +133,13 @@ def measure(
         programs.setdefault(str(WORLDS[name].options), []).append(name)
     rows = []
     for names in programs.values():
-        shared = {"layout": "close", "physics": "mujoco"} | options
-        shared |= WORLDS[names[0]].options
-        sample = envs.load(task, **{"seen_spheres": config.task.seen_spheres} | shared)
+        options: dict[str, Any] = {
+            "layout": "close",
+            "physics": "mujoco",
+            "observer": observer,
+            "seen_spheres": config.task.seen_spheres,
+        } | WORLDS[names[0]].options
+        sample = envs.load(task, **options)
         agent = policy.agent(sample.observation_size, sample.action_size, True)
         groups = {
             name: Group("trained", episodes, limit=sample.episode_length, **more)
@@ -152,8 +156,8 @@ def measure(
                 sample.episode_length,
                 task=task,
                 agent=agent,
-                seen_spheres=config.task.seen_spheres,
-                **shared,
+                restart=False,
+                **options,
             )
             for line in kinds:
                 made = study.env.controller
@@ -222,7 +226,7 @@ def main(argv: list[str] | None = None) -> None:
             args.lines,
             args.episodes,
             args.seed,
-            observer=args.observer,
+            args.observer,
         )
         show(rows, task)
         if args.json:

@@ -89,6 +89,7 @@ class Study:
         *,
         task: str = "trajectory",
         agent: Agent | None = None,
+        restart: bool = True,
         **options: Any,
     ):
         """Build the scene.
@@ -99,9 +100,10 @@ class Study:
             steps: Policy steps of each.
             task: A name in `envs.names()`.
             agent: The policy `trained`.
+            restart: Whether a world whose episode is over begins another one.
             **options: The task's; two spheres unless it says otherwise.
         """
-        self.groups, self.steps = tuple(groups), steps
+        self.groups, self.steps, self.restart = tuple(groups), steps, restart
         self.policies: Policies = POLICIES
         if agent is not None:
             self.policies = POLICIES | {"trained": lambda: trained(agent)}
@@ -140,6 +142,8 @@ class Study:
             )(worlds, keys, policy)
             over = (worlds.state.done > 0) | (worlds.state.info["step"] >= limit)
             figures |= {"over": over, "age": worlds.state.info["step"]}
+            if not self.restart:
+                return worlds, figures
             worlds = jax.lax.cond(
                 over.any(),
                 lambda w, key: _pick(over, self._fresh(key, policy), w),

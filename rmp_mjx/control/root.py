@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rmp_mjx.math import psd_solve
+from rmp_mjx.pytree import Constant
 
 ROUNDS, HURRIED = 64, 16
 """Most active sets that are tried, and those before the last row that is wrong moves
@@ -27,23 +28,23 @@ this size at least."""
 class Rows(NamedTuple):
     """Linear functions of the acceleration, each with a range: low <= A qdd <= high."""
 
-    A: Float[Array, "m n"]
+    A: Float[Constant, "m n"]
     """The rows."""
-    low: Float[Array, " m"]
+    low: Float[Constant, " m"]
     """Lower ends."""
-    high: Float[Array, " m"]
+    high: Float[Constant, " m"]
     """Upper ends."""
-    give: Float[Array, " m"]
+    give: Float[Constant, " m"]
     """Softness: 0 for a hard limit. A row with some gives way where not all can hold,
     by this share of what its multiplier moves it."""
 
     @staticmethod
-    def hard(A: Array, low: Array, high: Array) -> Rows:
+    def hard(A: Constant, low: Constant, high: Constant) -> Rows:
         """Limits that always hold, (m, n), (m,), (m,)."""
         return Rows(A, low, high, jnp.zeros_like(low))
 
     @staticmethod
-    def soft(A: Array, low: Array, high: Array) -> Rows:
+    def soft(A: Constant, low: Constant, high: Constant) -> Rows:
         """Limits that give way to hard ones."""
         return Rows(A, low, high, jnp.full_like(low, GIVE))
 

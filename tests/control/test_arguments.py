@@ -16,7 +16,8 @@ from tests.control.conftest import changed
 from tests.robot.test_model import GRIPPER
 
 Q = np.zeros(3, np.float32)
-ACTION = Action(*np.zeros((4, 3), np.float32))
+ZERO = np.zeros(3, np.float32)
+ACTION = Action(ZERO, ZERO, ZERO, ZERO)
 SLOTS = Obstacles.empty(spheres=2, boxes=1)
 
 

@@ -20,8 +20,8 @@ N = 7
 def test_a_distance_leaf_adds_what_contacts_take_from_it():
     """f grows by m times the acceleration towards the body; away from it by nothing."""
     leaf = collision_near()
-    x, xd = np.array([0.02, 0.02, 0.02]), np.array([-0.1, -0.1, 0.0])
-    push = np.array([-3.0, 3.0, -3.0])
+    x, xd = jnp.array([0.02, 0.02, 0.02]), jnp.array([-0.1, -0.1, 0.0])
+    push = jnp.array([-3.0, 3.0, -3.0])
     f, m = leaf.scalar(x, xd)
     pressed, same = leaf.scalar_against(x, xd, push)
     np.testing.assert_array_equal(m, same)
@@ -32,16 +32,16 @@ def test_joint_limits_add_it_on_the_side_that_contacts_press_to():
     """Each side by itself; RMPflow's leaf, a baseline, takes no notice."""
     leaf = JointLimitBarrier(np.array([-1.0]), np.array([1.0]))
     for q, push in ((0.85, 5.0), (-0.85, -5.0)):
-        x, rest = np.array([q]), np.zeros(1)
+        x, rest = jnp.array([q]), jnp.zeros(1)
         f, m = leaf.scalar(x, rest)
-        pressed, _ = leaf.scalar_against(x, rest, np.array([push]))
-        freed, _ = leaf.scalar_against(x, rest, np.array([-push]))
+        pressed, _ = leaf.scalar_against(x, rest, jnp.array([push]))
+        freed, _ = leaf.scalar_against(x, rest, jnp.array([-push]))
         np.testing.assert_allclose(pressed - f, -m * push, rtol=1e-5)
         np.testing.assert_allclose(freed, f, atol=1e-6 * np.abs(f).max())
     other = RMPflowJointLimit(np.array([-1.0]), np.array([1.0]))
-    x, xd = np.array([0.9]), np.array([0.1])
+    x, xd = jnp.array([0.9]), jnp.array([0.1])
     np.testing.assert_array_equal(
-        other.scalar(x, xd)[0], other.scalar_against(x, xd, np.array([9.0]))[0]
+        other.scalar(x, xd)[0], other.scalar_against(x, xd, jnp.array([9.0]))[0]
     )
 
 
