@@ -16,12 +16,10 @@ from envs.safety import SafetyRecord
 from envs.scene import ASSETS, Contacts
 from envs.task import View
 from envs.types import Entry, Score
-from rmp_mjx.control import Controller, per_link
+from rmp_mjx.control import Controller
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.rmp import ScalarLeaf
-from rmp_mjx.rmp.leaves import collision_near
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
@@ -198,15 +196,6 @@ class Door(ArmEnv[DoorOptions]):
         held = jnp.where(resting, task["held"] + 1, 0)
         task = {"held": held, "grip_force": record.work_force}
         return Score(task, reward, held >= self.hold, {"door_angle": angle})
-
-    def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
-        """Further off spheres and panel: forces at the handle press the arm on."""
-        near = collision_near()
-        panel = per_link(robot, np.append(np.full(robot.n - 1, 0.015), near.margin))
-        return {
-            "spheres": near.replace(margin=0.01),
-            "boxes": near.replace(margin=panel),
-        }
 
     @property
     def task_entries(self) -> tuple[Entry, ...]:

@@ -21,9 +21,6 @@ from envs.types import Entry, Score, State
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.rmp import ScalarLeaf
-from rmp_mjx.rmp.leaves import collision_near
-from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
 
@@ -94,10 +91,6 @@ class Push(ArmEnv[PushOptions]):
     """Slope of the rewards ``1 - tanh(slope d)`` [1/m]."""
     reach = 0.05
     """The block counts as pushed home within this distance of the goal [m]."""
-
-    def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
-        """Further and stiffer for spheres: forces at the block press the hand on."""
-        return {"spheres": collision_near().replace(margin=0.015, k_out=1e4, eta=40.0)}
 
     @property
     def task_entries(self) -> tuple[Entry, ...]:

@@ -17,7 +17,6 @@ from envs.scene import Contacts, no_objects
 from envs.types import ARM_ENTRIES, Entry, Score, State
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.rmp import ScalarLeaf
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
@@ -137,11 +136,6 @@ class Task(abc.ABC, Generic[OptionsT]):
     @abc.abstractmethod
     def keep_clear(self, task: dict[str, Array]) -> Float[Array, "v 3"]:
         """Points that the spheres' layout keeps clear [m]."""
-
-    def collision_leaves(self, robot: Robot) -> dict[str, ScalarLeaf]:
-        """Collision leaves by kind of obstacle, where the default does not fit."""
-        del robot
-        return {}
 
     def objects(self, spec: mujoco.MjSpec) -> Contacts:
         """Add the task's objects to the scene."""

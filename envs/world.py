@@ -21,9 +21,7 @@ from envs.task import OptionsT, Task
 from envs.types import ControlMemory
 from rmp_mjx import sim
 from rmp_mjx.control import (
-    RMPVICES,
     Controller,
-    Leaves,
     StopGuard,
     WeightedActionRange,
 )
@@ -91,17 +89,13 @@ class World(Task[OptionsT]):
         return robot.replace(q_home=self.q_start)
 
     def _named_controller(self) -> Controller:
-        """The options' controller; the task's leaves take the place of default ones."""
+        """The options' controller."""
         controller = CONTROLLERS[self.options.controller](self.robot)
         controller = controller.replace(period=self.options.sim_dt)
         if self.options.guard:
             controller = controller.replace(guard=self._guard())
         if self.options.leaf_weights:
             controller = controller.replace(action_range=WeightedActionRange())
-        collision = self.collision_leaves(self.robot)
-        if collision and isinstance(controller, RMPVICES):
-            default = controller.leaves == Leaves.default(self.robot)
-            return controller.with_collision(collision) if default else controller
         return controller
 
     def _guard(self) -> StopGuard:
