@@ -41,9 +41,13 @@ class World(NamedTuple):
 
 
 WORLDS = {
-    "close": World("two spheres, close", {"obstacles": 4}, {"spheres": 2}),
+    "close": World(
+        "two spheres, close", {"obstacles": 4}, {"spheres": 2, "speed": 0.0}
+    ),
     "moving": World("four at 0.2 m/s", {"obstacles": 4}, {"spheres": 4, "speed": 0.2}),
-    "weak": World("half the torque", {"obstacles": 4}, {"spheres": 2, "torque": 0.5}),
+    "weak": World(
+        "half the torque", {"obstacles": 4}, {"spheres": 2, "speed": 0.0, "torque": 0.5}
+    ),
     "large": World("two of 8 cm", {"obstacles": 2, "sphere_radius": 0.08}, {}),
     "armature": World(
         "robosuite's armature", {"obstacles": 3, "armature": "robosuite"}, {}
@@ -215,7 +219,8 @@ def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure()
-    settings = {k: v for k, v in vars(args).items() if k not in ("json", "docs")}
+    settings = vars(args) | {"policies": args.policies.name}
+    settings = {k: v for k, v in settings.items() if k not in ("json", "docs")}
     rows: list[Row] = []
     for task in args.tasks:
         path = args.policies / f"{task}-{args.suffix}.safetensors"
