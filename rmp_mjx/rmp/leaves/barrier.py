@@ -76,6 +76,18 @@ class Barrier(ScalarLeaf):
         Returns:
             Natural force ``f`` and metric ``m``, shaped like ``x``.
         """
+        return self._scalar(x, xd, 0.0)
+
+    def scalar_against(
+        self, x: Float[Array, "*s"], xd: Float[Array, "*s"], push: Float[Array, "*s"]
+    ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
+        """As `scalar`, where contacts accelerate the distances by ``push``."""
+        return self._scalar(x, xd, jnp.maximum(-push, 0.0))
+
+    def _scalar(
+        self, x: Array, xd: Array, pressed: Array | float
+    ) -> tuple[Array, Array]:
+        """Force and metric, with the acceleration that contacts take."""
         braking = 0.5 * self.stop_time * jnp.minimum(xd, 0.0)
         gap = jnp.maximum(x - self.margin + braking, self.x_min)
         active = gap < self.r
@@ -90,5 +102,5 @@ class Barrier(ScalarLeaf):
         gap4 = jnp.minimum(gap, 1e3) ** 4
         m = self.mu * fade**2 * (v * v + self.eps)
         m = hold * jnp.minimum(m, jnp.minimum(self.cap, 1e25) * gap4) / gap4
-        pull = v * v + gap * (self.k_out * depth - self.eta * v)
+        pull = v * v + gap * (self.k_out * depth - self.eta * v + pressed)
         return m * pull / gap, m
