@@ -90,7 +90,7 @@ class Options:
     guard: bool = False
     """Put `StopGuard` behind the controller, for spheres of this speed, noise and
     delay."""
-    observer: Literal["none", "momentum", "exact"] = "none"
+    observer: Literal["none", "momentum", "exact"] = "momentum"
     """What tells the controller the contacts' joint torque: nothing, a momentum
     observer, or its one-step form, which is exact in simulation and one step late."""
     observer_gain: float = 100.0

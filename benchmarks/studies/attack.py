@@ -113,6 +113,7 @@ class Attack:
             obstacle_speed=speed,
             start_noise=noise,
             physics="mujoco",
+            observer="none",
         )
         self.controller, self.speed = controller, speed
         self.action_size = rmp.ACTION_SIZE + 3 * SPHERES
