@@ -49,7 +49,7 @@ class ActionRange(Pytree):
             kp_ori=kp[3:],
         )
 
-    def _clipped(self, action: Float[ArrayLike, " m"]) -> Float[Array, " m"]:
+    def _clipped(self, action: ArrayLike) -> Float[Array, " m"]:
         check("action", action, (self.size,))
         action = jnp.asarray(action)
         return jnp.clip(jnp.where(jnp.isfinite(action), action, 0.0), -1.0, 1.0)

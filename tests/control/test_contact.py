@@ -123,30 +123,41 @@ def _world_points(robot, q):
         yield body, data.xpos[b] + data.xmat[b].reshape(3, 3) @ offset, radius
 
 
-def test_a_force_at_the_hand_turns_it_as_computed(run64, robot, states):
+@jax.jit(compiler_options=QUICK)
+def hand(robot, q):
+    """Inertia and Jacobians at the hand."""
+    arm = arm_state(robot, q, jnp.zeros_like(q))
+    site = site_state(robot, arm)
+    return dynamics(robot, arm)[0], site.J_pos, site.J_ori
+
+
+@jax.jit(compiler_options=QUICK)
+def turning(robot, q, w):
+    """The turn that a blocking force gives the hand."""
+    arm = arm_state(robot, q, jnp.zeros_like(q))
+    return turning_by_contact(site_state(robot, arm), dynamics(robot, arm)[0], w)
+
+
+def test_a_force_at_the_hand_turns_it_as_computed(robot, states):
     """A rigid point contact takes the hand's whole commanded acceleration: the turn is
     that of the constrained dynamics, in NumPy; 1e-7 relative, float64."""
-    q, qd, _ = states(0)
     rng = np.random.default_rng(2)
-    with jax.enable_x64(True):
-        for k in range(20):
-            arm = arm_state(robot, jnp.asarray(q[k]), jnp.asarray(qd[k]))
-            site = site_state(robot, arm)
-            Mq, _ = dynamics(robot, arm)
-            M, Jp, Jo = (np.asarray(x) for x in (Mq, site.J_pos, site.J_ori))
-            a = rng.normal(size=3)  # commanded, all of it taken by the contact
-            mobility = Jp @ np.linalg.solve(M, Jp.T)
-            force = -np.linalg.solve(mobility, a)
-            w = np.linalg.solve(M, Jp.T @ force)
-            np.testing.assert_allclose(Jp @ w, -a, atol=1e-9)
-            turn = np.asarray(turning_by_contact(site, Mq, jnp.asarray(w)))
-            size = np.abs(turn).max()
-            np.testing.assert_allclose(turn, Jo @ w, rtol=0, atol=1e-7 * size)
-            # A torque at the hand alone, which no force explains, is not asked back.
-            null = np.linalg.solve(M, Jo.T @ rng.normal(size=3))
-            null -= np.linalg.solve(M, Jp.T @ np.linalg.solve(mobility, Jp @ null))
-            rest = turning_by_contact(site, Mq, jnp.asarray(null))
-            np.testing.assert_allclose(rest, 0.0, atol=1e-9)
+    for q in states(0)[0][:20]:
+        with jax.enable_x64(True):
+            M, Jp, Jo = (np.asarray(x) for x in hand(robot, q))
+        a = rng.normal(size=3)  # commanded, all of it taken by the contact
+        mobility = Jp @ np.linalg.solve(M, Jp.T)
+        force = -np.linalg.solve(mobility, a)
+        w = np.linalg.solve(M, Jp.T @ force)
+        np.testing.assert_allclose(Jp @ w, -a, atol=1e-9)
+        # A torque at the hand alone, which no force explains, is not asked back.
+        null = np.linalg.solve(M, Jo.T @ rng.normal(size=3))
+        null -= np.linalg.solve(M, Jp.T @ np.linalg.solve(mobility, Jp @ null))
+        with jax.enable_x64(True):
+            turn, rest = (np.asarray(turning(robot, q, x)) for x in (w, null))
+        size = np.abs(turn).max()
+        np.testing.assert_allclose(turn, Jo @ w, rtol=0, atol=1e-7 * size)
+        np.testing.assert_allclose(rest, 0.0, atol=1e-9)
 
 
 def test_gradients_through_the_response_are_finite(answer, robot):

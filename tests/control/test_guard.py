@@ -114,8 +114,8 @@ def test_the_bounds_are_not_idle(arm, motion):
 
 
 def test_the_holding_torque_is_the_bias_at_rest(arm):
-    q = arm.q_home + 0.3
     with jax.enable_x64(True):
+        q = jnp.asarray(arm.q_home + 0.3)
         state = arm_state(arm, q, jnp.zeros(arm.n))
         held, bias = holding_torque(arm, state), dynamics(arm, state)[1]
     np.testing.assert_allclose(held, bias, atol=1e-12)
