@@ -103,7 +103,8 @@ def forward_kinematics(
     Returns:
         Origins (3, n) [m] and world orientations (3, 3, n).
     """
-    shift = jnp.asarray(q) - robot.q_ref
+    q = jnp.asarray(q)
+    shift = q - jnp.asarray(robot.q_ref, q.dtype)
     c, s = jnp.cos(shift), jnp.sin(shift)
     p, R = jnp.zeros(3, c.dtype), jnp.eye(3, dtype=c.dtype)
     origins, rotations = [], []

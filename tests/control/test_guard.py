@@ -24,6 +24,12 @@ STEP, SPEED, RADIUS = 0.005, 0.2, 0.05
 """Control step [s], speed [m/s] and radius [m] of the spheres."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _fresh_caches():
+    """JAX may keep a constant in the precision of an earlier module's trace."""
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="module", params=["jaco", "gripper"])
 def arm(request, robot):
     """The Jaco 2, and an arm of another build."""

@@ -94,6 +94,12 @@ def estimates(robot, run, dt=DT, dtype: Any = np.float32, **options):
         return np.asarray(_estimates(observer, qd, Mq, bias, tau, dt))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _fresh_caches():
+    """JAX may keep a constant in the precision of an earlier module's trace."""
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="module")
 def pressed(robot):
     """The hand pressed on a table and let go."""

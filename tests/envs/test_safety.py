@@ -115,7 +115,8 @@ def test_penalty_and_termination_can_be_switched(far, close, scripted):
 
 def test_a_sphere_that_found_no_place_is_counted(far, quiet):
     placed = jnp.ones((LANES, 2), bool).at[1, 0].set(False).at[2].set(False)
-    spheres = quiet.info["spheres"].replace(placed=placed)
+    missing = jnp.sum(~placed, axis=1)
+    spheres = quiet.info["spheres"].replace(placed=placed, missing=missing)
     after = far.step(quiet.replace(info=quiet.info | {"spheres": spheres}), REST)
     np.testing.assert_array_equal(
         after.metrics["unplaced_obstacles"], [0, 1, 2, 0, 0, 0, 0, 0]
