@@ -236,13 +236,11 @@ def main(argv: list[str] | None = None) -> None:
         show(rows, task)
         if args.json:
             write_json(args.json, rows, **settings)
-    tables = {
-        f"contact-{t}": table(t, args.worlds, args.lines, rows) for t in args.tasks
-    }
-    for text in tables.values():
-        print(text)
+    tables = [table(task, args.worlds, args.lines, rows) for task in args.tasks]
+    text = "\n\n".join(tables)
+    print(text)
     if args.docs:
-        args.docs.write_text(insert(args.docs.read_text(), tables))
+        args.docs.write_text(insert(args.docs.read_text(), {"contact": text}))
 
 
 if __name__ == "__main__":
