@@ -139,6 +139,8 @@ def settings(preset: Preset) -> dict[str, Any]:
     config = preset.training
     values = dataclasses.asdict(config.ppo)
     del values["reward_scaling"]  # of another trainer
+    if values["final_log_std"] is None:  # nothing is annealed
+        del values["final_log_std"], values["anneal_steps"]
     return values | {"num_timesteps": config.run.num_timesteps}
 
 
