@@ -18,13 +18,13 @@ import numpy as np
 
 import envs
 from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
+from benchmarks.studies.failures import share
 from benchmarks.studies.random_policies import Clipped
 from benchmarks.studies.safety_study import ENDING, Group, Study
 from envs.cli import load_config
 from rmp_mjx import RMPVICES, VICES, runtime
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.training.policy import load_policy
-from rmp_mjx.training.stats import clopper_pearson
 
 Figures = dict[str, np.ndarray]
 
@@ -106,19 +106,14 @@ def judge(figures: Figures) -> Figures:
     return {
         "success": ever("success"),
         "event": np.any(np.stack([ever(name) for name in ENDING]), axis=0),
-        "at_fault": ever("at_fault" if "at_fault" in figures else "collision"),
+        "at_fault": ever("at_fault"),
     }
 
 
 def rows_of(key: str, judged: Figures) -> list[Row]:
     """Rates of one cell with exact intervals."""
-    rows = []
-    for name in ("success", "event", "at_fault"):
-        hits, count = int(judged[name].sum()), len(judged[name])
-        low, high = clopper_pearson(hits, count)
-        note = f"{hits} of {count}; 95 % interval {low:.4f}-{high:.4f}"
-        rows.append(Row(f"{key}/{name}", hits / count, "", note))
-    return rows
+    shares = {name: share(hits) for name, hits in judged.items()}
+    return [Row(f"{key}/{name}", x, "", note) for name, (x, note) in shares.items()]
 
 
 def measure(

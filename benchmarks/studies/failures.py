@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy import stats
 
 import envs
 from benchmarks.common import Row, markdown
@@ -22,6 +21,7 @@ from benchmarks.studies.policies import POLICIES, stiffness
 from benchmarks.studies.safety_study import ENDING, World, advance
 from envs import spheres
 from envs.base import ArmEnv
+from rmp_mjx.training.stats import clopper_pearson
 
 CONTROLLERS = {"rmp_vices": "RMP-VICES", "vices": "VICES"}
 """Controllers and their names in the tables."""
@@ -135,10 +135,8 @@ def cross(controller: str, cases: Crossing, worlds: int, seed: int) -> list[Figu
 
 def share(hits: Any) -> tuple[float, str]:
     """Share of true entries, and its count with the exact 95 % interval."""
-    found = stats.binomtest(int(hits.sum()), len(hits)).proportion_ci(method="exact")
-    text = (
-        f"{hits.sum()} of {len(hits)}; 95 % interval {found.low:.3f}-{found.high:.3f}"
-    )
+    low, high = clopper_pearson(int(hits.sum()), len(hits))
+    text = f"{hits.sum()} of {len(hits)}; 95 % interval {low:.3f}-{high:.3f}"
     return float(hits.mean()), text
 
 
