@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy import stats
 
 import envs
 import rmp_mjx as rmp
 from benchmarks.common import Row, insert, markdown, show, write_json
+from benchmarks.studies.random_policies import poisson
 from envs.options import CTRL_DT
 from envs.safety import LIMIT_MARGIN
 from envs.scene import ARM
@@ -31,7 +31,7 @@ from rmp_mjx.control.guard import StopGuard
 from rmp_mjx.metric import SUCCESS, Metric, by_name
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot.kinematics import arm_state
-from rmp_mjx.robot.point_state import point_state
+from rmp_mjx.robot.point_state import point_carrier, point_state
 from rmp_mjx.sim.base import pair_sensors
 from rmp_mjx.training.config import PPOConfig
 from rmp_mjx.training.learning.ppo import PPO, make_ppo
@@ -149,8 +149,7 @@ class Attack:
         segment = np.array(robot.points.segment)
         spin = jnp.sqrt(arm.V.ang @ arm.V.ang)[segment]
         speed = jnp.sqrt(points.v @ points.v) + spin * jnp.asarray(robot.points.radius)
-        links = np.arange(robot.n)[:, None] == segment
-        return speed, jnp.max(jnp.where(links, speed, 0.0), axis=1)
+        return speed, jnp.max(point_carrier(robot) * speed[None], axis=1)
 
     def _contact_speed(self, data: Any, spheres: Any, touching: Array) -> Array:
         """Speed of the arm where it touches [m/s], 0 if it does not.
@@ -296,7 +295,7 @@ def rows_of(name: str, sums: dict[str, float], substeps: int) -> list[Row]:
     rows = [Row(f"{name}_control_steps", controls, "", f"{steps:.0f} policy steps")]
     for event in ("contacts", "moving", "limits", "mispredicted", "unproved"):
         many = sums[event]
-        top = stats.chi2.ppf(0.975, 2 * many + 2) / 2
+        _, top = poisson(int(many))
         note = f"95 % upper bound {1e6 * top / controls:.3g} per 10^6 control steps"
         rows.append(Row(f"{name}_{event}", many, "", note))
     episodes = max(sums["episodes"], 1.0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from rmp_mjx.control.leaves import CollisionLeaf, leaf_of
 from rmp_mjx.obstacles import Obstacles
@@ -24,7 +24,12 @@ from rmp_mjx.robot.kinematics import (
     select,
 )
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.robot.point_state import PointRMP, point_state, pull_to_joints
+from rmp_mjx.robot.point_state import (
+    PointRMP,
+    point_carrier,
+    point_state,
+    pull_to_joints,
+)
 from rmp_mjx.shapes import Gap
 from rmp_mjx.vec import Vec
 from rmp_mjx.xla import materialize
@@ -76,7 +81,10 @@ def obstacle_branch(
     world = points.x + Vec(origin[0], origin[1], origin[2])
     rho = jnp.asarray(robot.points.radius, arm.p.dtype)
     total, clearance, pressed = None, {}, jnp.zeros((), arm.p.dtype)
-    push = None if w is None else _accelerations(robot, arm, points.x, w)
+    push = None
+    if w is not None:
+        pushed = select(motion_of(robot, arm.S, w), point_carrier(robot))
+        push = pushed.at(points.x).map(lambda c: c[None])
     gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
     for kind, gap in gaps.items():
         clearance[kind] = jnp.min(
@@ -96,13 +104,6 @@ def obstacle_branch(
     if total is None or not robot.points.segment:
         return RMP.zero(robot.n, arm.p.dtype), around
     return pull_to_joints(robot, arm, points, total), around
-
-
-def _accelerations(robot: Robot, arm: ArmState, x: Vec, w: Array) -> Vec:
-    """Accelerations of the control points at x by those of the joints, w; (1, p)."""
-    segment = np.array(robot.points.segment, int)
-    carrier = (np.arange(robot.n)[:, None] == segment[None]).astype(float)
-    return select(motion_of(robot, arm.S, w), carrier).at(x).map(lambda c: c[None])
 
 
 def _for_all_obstacles(parameter: Param) -> Param:
@@ -179,34 +180,56 @@ def self_gaps(
     Returns:
         Distance [m], rate [m/s], the acceleration's part without qdd [m/s^2], gradient.
     """
-    capsules, n = robot.capsules, robot.n
-    ids = np.array(capsules.pairs).T
-    segment, radii = np.array(capsules.segment)[ids], capsules.radius[ids]
-    far, near = (np.arange(n)[:, None] == s for s in segment)
-    V, A = (select(motion, 1.0 * far - near) for motion in (arm.V, arm.A))
-
-    # The four ends of each pair, far then near, and their velocities.
-    ends = [(end, side) for side in (0, 1) for end in (capsules.start, capsules.end)]
-    offset = jnp.concatenate([end[ids[side]] for end, side in ends])
-    x, carrier = carry_points(robot, arm, offset, np.repeat(segment, 2, axis=0).ravel())
-    v = select(arm.V, carrier).at(x)
+    pairs = capsule_pairs(robot, arm)
+    x, segment = pairs.ends, pairs.segment
+    V, A = (select(motion, pairs.relative) for motion in (arm.V, arm.A))
+    v = select(arm.V, pairs.carrier).at(x)
 
     def unit_wrench(x: Vec) -> tuple[Motion, Array]:
-        g, p, norm = _segment_gap(x)
+        g, p, norm = segment_gap(x)
         normal = g * (1.0 / norm)
         return Motion(normal, p.cross(normal)), norm
 
     (w, norm), (wdot, _) = jax.jvp(unit_wrench, (x,), (v,))
     rate = w.lin @ V.lin + w.ang @ V.ang
     curvature = w.lin @ A.lin + w.ang @ A.ang + wdot.lin @ V.lin + wdot.ang @ V.ang
-    joints = np.arange(n)
+    joints = np.arange(robot.n)
     between = (joints > segment[1][:, None]) & (joints <= segment[0][:, None])
     rows = jnp.sum(w.stack()[:, :, None] * arm.S.stack()[:, None, :], axis=0)
     rows = jnp.where(between, rows, 0.0)
-    return norm - jnp.sum(radii, axis=0), rate, curvature, rows
+    return norm - pairs.reach, rate, curvature, rows
 
 
-def _segment_gap(x: Vec) -> tuple[Vec, Vec, Array]:
+class CapsulePairs(NamedTuple):
+    """The k pairs of link capsules that can touch: a far link's and a near one's."""
+
+    ends: Vec
+    """Starts of the far capsules, their ends, starts and ends of the near ones, (4k,),
+    relative to the arm's base point [m]."""
+    carrier: Float[np.ndarray, "n ends"]
+    """Which link carries which end, one-hot."""
+    segment: Int[np.ndarray, "2 k"]
+    """Joints that carry the far and the near link; -1 for the base."""
+    relative: Float[np.ndarray, "n k"]
+    """Far link less near link: `select` with it gives the relative motion."""
+    reach: Float[Array, " k"]
+    """Sum of both radii [m]."""
+
+
+def capsule_pairs(robot: Robot, arm: ArmState) -> CapsulePairs:
+    """The pairs in this state; there must be some."""
+    capsules = robot.capsules
+    ids = np.array(capsules.pairs).T
+    segment = np.array(capsules.segment)[ids]
+    far, near = (np.arange(robot.n)[:, None] == s for s in segment)
+    sides = [(end, side) for side in (0, 1) for end in (capsules.start, capsules.end)]
+    offset = jnp.concatenate([end[ids[side]] for end, side in sides])
+    x, carrier = carry_points(robot, arm, offset, np.repeat(segment, 2, axis=0).ravel())
+    reach = jnp.sum(capsules.radius[ids], axis=0)
+    return CapsulePairs(x, carrier, segment, 1.0 * far - near, reach)
+
+
+def segment_gap(x: Vec) -> tuple[Vec, Vec, Array]:
     """Closest points of segment pairs: vector from near to far, a point, distance.
 
     x holds the starts and ends of the far segments, then those of the near ones.

@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from rmp_mjx.control.avoidance import _segment_gap
+from rmp_mjx.control.avoidance import capsule_pairs, segment_gap
 from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant, Pytree
@@ -28,11 +28,11 @@ from rmp_mjx.robot.kinematics import (
     ArmState,
     Motion,
     base_point,
-    carry_points,
+    motion_of,
     select,
 )
 from rmp_mjx.robot.model import Robot
-from rmp_mjx.robot.point_state import point_state
+from rmp_mjx.robot.point_state import point_carrier, point_state
 from rmp_mjx.shapes import Planes
 from rmp_mjx.vec import Vec
 
@@ -134,7 +134,7 @@ class StopGuard(Pytree):
         Raises:
             ValueError: A sliding joint has no limits.
         """
-        damping = robot.mj_model.dof_damping[: robot.n].copy()
+        damping, _ = robot.friction
         return cls(Bounds.of(robot), damping, step=step, **options)
 
     def __call__(
@@ -218,10 +218,9 @@ class StopGuard(Pytree):
         obstacles: Obstacles,
     ) -> Scene:
         """Distances in this state, and how two velocities change them."""
-        inner = np.triu(np.ones((robot.n, robot.n)))
-        V = Motion.of(_dot((arm.S * w).stack(), inner))
+        V = motion_of(robot, arm.S, w)
         points = point_state(robot, arm)
-        at_w = select(V, _carrier(robot)).at(points.x)
+        at_w = select(V, point_carrier(robot)).at(points.x)
         rho = jnp.asarray(robot.points.radius, arm.p.dtype)
         world = points.x + Vec(*base_point(robot))
         gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
@@ -332,7 +331,7 @@ class StopGuard(Pytree):
 
         spin = _length(mix_vec(scene.spins))
         links = jnp.stack([*loss(bounds.bend, bounds.lever), spin])
-        slip, gain, spin = _dot(links, _carrier(robot))[:, None, :]
+        slip, gain, spin = _dot(links, point_carrier(robot))[:, None, :]
         rho = jnp.asarray(robot.points.radius, u.dtype)
         speed = _length(mix_vec(scene.points))[None] + rho[None] * spin
         for distance, rates, fastest, active in scene.rows:
@@ -360,36 +359,24 @@ def _pairs(
     Returns:
         Distances (2, k) and their rates at the arm's velocity and at the twists V.
     """
-    capsules = robot.capsules
-    if not capsules.pairs:
+    if not robot.capsules.pairs:
         return None
-    ids = np.array(capsules.pairs).T
-    segment = np.array(capsules.segment)[ids]
-    far, near = (np.arange(robot.n)[:, None] == s for s in segment)
-    ends = [(end, side) for side in (0, 1) for end in (capsules.start, capsules.end)]
-    offset = jnp.concatenate([end[ids[side]] for end, side in ends])
-    x, _ = carry_points(robot, arm, offset, np.repeat(segment, 2, axis=0).ravel())
-    g, _, norm = _segment_gap(x)
+    pairs = capsule_pairs(robot, arm)
+    x = pairs.ends
+    g, _, norm = segment_gap(x)
     normal = g.map(lambda c: (c / norm)[None])
     x = x.map(lambda c: c.reshape(4, -1))
     along = normal @ x
-    reach = jnp.asarray(np.sum(capsules.radius[ids], axis=0), along.dtype)
-    distance = along[:2] - (jnp.max(along[2:], axis=0) + reach)[None]
+    distance = along[:2] - (jnp.max(along[2:], axis=0) + pairs.reach)[None]
     tips = x.map(lambda c: c[:2])
     rates = []
     for motion in (arm.V, V):
-        relative = select(motion, 1.0 * far - near)
+        relative = select(motion, pairs.relative)
         relative = Motion(
             *(part.map(lambda c: c[None]) for part in (relative.lin, relative.ang))
         )
         rates.append(normal @ relative.at(tips))
     return distance, (rates[0], rates[1])
-
-
-def _carrier(robot: Robot) -> Float[np.ndarray, "n p"]:
-    """Which link carries which control point."""
-    segment = np.array(robot.points.segment, int)
-    return (np.arange(robot.n)[:, None] == segment[None]).astype(float)
 
 
 def _length(v: Vec) -> Array:

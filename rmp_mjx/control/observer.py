@@ -130,13 +130,11 @@ class ContactObserver(Pytree):
             dead_band: See `dead_band`.
             delay: See `delay`.
         """
-        model = robot.mj_model
-        dofs = [int(model.joint(name).dofadr[0]) for name in robot.joint_names]
-        damping, dry = model.dof_damping[dofs], model.dof_frictionloss[dofs]
+        damping, dry = robot.friction
         return ContactObserver(
-            damping=damping.copy() if np.any(damping) else None,
+            damping=damping if np.any(damping) else None,
             held=robot.damping,
-            dry=dry.copy() if np.any(dry) else None,
+            dry=dry if np.any(dry) else None,
             gain=gain,
             dead_band=dead_band,
             delay=delay,

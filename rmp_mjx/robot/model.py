@@ -138,6 +138,16 @@ class Robot(Pytree):
         return mujoco.MjSpec.from_string(self.mjcf, assets=dict(self.assets))
 
     @property
+    def friction(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Friction of the joints in the MJCF, whether the controllers compensate it.
+
+        Viscous damping, (n,) [N m s/rad or N s/m], and dry friction, (n,) [N m or N].
+        """
+        model = self.mj_model
+        dofs = [int(model.joint(name).dofadr[0]) for name in self.joint_names]
+        return model.dof_damping[dofs], model.dof_frictionloss[dofs]
+
+    @property
     def fingerprint(self) -> str:
         """32 hex digits that say which arm this is; see `fingerprint.fingerprint`."""
         return fingerprint(self)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.rmp import RMP
@@ -67,6 +67,12 @@ def point_state(robot: Robot, arm: ArmState) -> PointState:
     V, A = select(arm.V, carrier), select(arm.A, carrier)
     v = V.at(x)
     return PointState(x, v, A.at(x) + V.ang.cross(v))
+
+
+def point_carrier(robot: Robot) -> Float[np.ndarray, "n p"]:
+    """Which link carries which control point: `select` with it, one-hot."""
+    segment = np.array(robot.points.segment, int)
+    return (np.arange(robot.n)[:, None] == segment[None]).astype(float)
 
 
 def pull_to_joints(

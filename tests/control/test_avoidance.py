@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rmp_mjx.control.avoidance import _segment_gap
+from rmp_mjx.control.avoidance import segment_gap
 from rmp_mjx.control.tree import _segment_distance
 from rmp_mjx.robot.kinematics import base_point, forward_kinematics
 from rmp_mjx.vec import Vec
@@ -16,7 +16,7 @@ from rmp_mjx.vec import Vec
 def _distance(far, near):
     """Distance of segments (k, 2, 3), by the closed form and by the tree's own."""
     ends = jnp.concatenate([far[:, 0], far[:, 1], near[:, 0], near[:, 1]])
-    gap, _, norm = _segment_gap(Vec.of(ends))
+    gap, _, norm = segment_gap(Vec.of(ends))
     tree = jax.vmap(_segment_distance)(far[:, 0], far[:, 1], near[:, 0], near[:, 1])
     return norm, gap.stack(-1), tree
 
