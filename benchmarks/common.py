@@ -26,7 +26,6 @@ import rmp_mjx as rmp
 from rmp_mjx import runtime
 from rmp_mjx.control.contact import turning_by_contact
 from rmp_mjx.control.tree import rmp_vices_tree
-from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, site_state
 from rmp_mjx.training.learning import devices
 
@@ -324,12 +323,11 @@ class AutodiffRMPVICES(rmp.RMPVICES):
         """
         out = super().__call__(q, qd, setpoint, obstacles, tau_ext, tau_last)
         q, qd = jnp.asarray(q), jnp.asarray(qd)
-        arm = arm_state(self.robot, q, qd)
-        Mq, bias = dynamics(self.robot, arm)
-        weights, w, turning = out.diagnostics, None, 0.0
-        if tau_ext is not None and self.contact is not None:
-            w = self.contact.acceleration(Mq, jnp.asarray(tau_ext))
-            turning = turning_by_contact(site_state(self.robot, arm), Mq, w)
+        weights, Mq, bias, turning = out.diagnostics, out.Mq, out.bias, 0.0
+        w = self._by_contact(Mq, None if tau_ext is None else jnp.asarray(tau_ext))
+        if w is not None:
+            site = site_state(self.robot, arm_state(self.robot, q, qd))
+            turning = turning_by_contact(site, Mq, w)
         tree = rmp_vices_tree(
             self.robot,
             self.leaves.weighted(setpoint.weights).braking(weights["stop_time"]),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from rmp_mjx.control.avoidance import self_gaps
 from rmp_mjx.control.torque import clip_torque, torque_range
@@ -15,7 +15,7 @@ from rmp_mjx.control.vices import VICES
 from rmp_mjx.math import cholesky, psd_solve, solve_lower
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
-from rmp_mjx.robot.kinematics import ArmState, arm_state, base_point
+from rmp_mjx.robot.kinematics import ArmState, base_point
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.types import ControlOutput, Setpoint
@@ -76,41 +76,34 @@ class FilteredVICES(VICES):
     penalty: Float[Constant, ""] | float = 1e3
     """Cost of a squared violation over that of a squared change."""
 
-    def __call__(
+    def unguarded(
         self,
-        q: Float[ArrayLike, " n"],
-        qd: Float[ArrayLike, " n"],
+        arm: ArmState,
         setpoint: Setpoint,
         obstacles: Obstacles,
-        tau_ext: Float[ArrayLike, " n"] | None = None,
-        tau_last: Float[ArrayLike, " n"] | None = None,
+        tau_ext: Float[Array, " n"] | None,
+        tau_last: Float[Array, " n"] | None,
     ) -> ControlOutput:
-        """Torque for one state; same signature as `RMPVICES`.
+        """Torque for one state.
 
         Returns:
             As `VICES`; diagnostics also has `solved`, 1 where the program converged and
             the constraints that it leaves out hold.
-
-        Raises:
-            ValueError: An argument has a wrong shape or dtype.
         """
-        unguarded = super(FilteredVICES, self.replace(guard=None)).__call__
-        out = unguarded(q, qd, setpoint, obstacles, tau_ext, tau_last)
-        q, qd, Mq, bias = jnp.asarray(q), jnp.asarray(qd), out.Mq, out.bias
-        arm = arm_state(self.robot, q, qd)
+        out = super().unguarded(arm, setpoint, obstacles, tau_ext, tau_last)
+        Mq, bias = out.Mq, out.bias
         wanted = psd_solve(Mq, out.tau - bias)
-        barriers = self.barriers(arm, q, qd, obstacles)
+        barriers = self.barriers(arm, arm.q, arm.qd, obstacles)
         qdd, solved = self._filter(wanted, barriers, Mq, bias)
         dynamic = jnp.matmul(Mq, qdd, precision="highest")
         low, high = torque_range(self.robot, tau_last, self.period)
         tau, limit = clip_torque(dynamic + bias, low, high)
-        out = out.replace(
+        return out.replace(
             tau=tau,
             qdd=qdd,
             f=dynamic,
             diagnostics={"torque_limit": limit, "solved": solved},
         )
-        return self.guarded(out, arm, obstacles, tau_ext)
 
     def barriers(
         self,

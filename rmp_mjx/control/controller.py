@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -9,12 +10,18 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Float, Real
 
 from rmp_mjx.control.action import ActionRange, compose_setpoint
-from rmp_mjx.control.arguments import check, check_action
+from rmp_mjx.control.arguments import (
+    check,
+    check_action,
+    check_obstacles,
+    check_setpoint,
+    check_state,
+)
 from rmp_mjx.control.guard import StopGuard
 from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant, Pytree
-from rmp_mjx.robot.kinematics import ArmState, site_pose
+from rmp_mjx.robot.kinematics import ArmState, arm_state, site_pose
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 
@@ -58,7 +65,7 @@ class Controller(Protocol):
         ...
 
 
-class ImpedanceController(Pytree):
+class ImpedanceController(Pytree, abc.ABC):
     """A controller whose target is a pose and a stiffness of the end effector."""
 
     robot: Robot
@@ -105,26 +112,66 @@ class ImpedanceController(Pytree):
         p, R = site_pose(self.robot, jnp.asarray(q))
         return compose_setpoint(p, R, action, time)
 
-    def guarded(
+    def __call__(
+        self,
+        q: Float[ArrayLike, " n"],
+        qd: Float[ArrayLike, " n"],
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+        tau_ext: Float[ArrayLike, " n"] | None = None,
+        tau_last: Float[ArrayLike, " n"] | None = None,
+    ) -> ControlOutput:
+        """Torque for one state.
+
+        Args:
+            q: Joint positions, (n,) [rad].
+            qd: Joint velocities, (n,) [rad/s].
+            setpoint: Impedance target, from `setpoint`.
+            obstacles: Padded obstacle slots.
+            tau_ext: Joint torque of the contacts, (n,) [N m], measured or from a
+                `ContactObserver`; None: not known.
+            tau_last: Torque of the last control step, (n,) [N m]; None: not known. It
+                matters where the robot has a limit of the torques' rate.
+
+        Returns:
+            What `unguarded` gives, behind the guard if there is one.
+
+        Raises:
+            ValueError: An argument has a wrong shape or dtype.
+        """
+        check_state(self.robot.n, q, qd, tau_ext, tau_last)
+        check_setpoint(setpoint)
+        check_obstacles(obstacles)
+        arm = arm_state(self.robot, jnp.asarray(q), jnp.asarray(qd))
+        ext, last = (
+            None if tau is None else jnp.asarray(tau) for tau in (tau_ext, tau_last)
+        )
+        out = self.unguarded(arm, setpoint, obstacles, ext, last)
+        return self._guarded(out, arm, obstacles, ext)
+
+    @abc.abstractmethod
+    def unguarded(
+        self,
+        arm: ArmState,
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+        tau_ext: Float[Array, " n"] | None,
+        tau_last: Float[Array, " n"] | None,
+    ) -> ControlOutput:
+        """The controller's own output for one state; arguments as of the call."""
+
+    def _guarded(
         self,
         out: ControlOutput,
         arm: ArmState,
         obstacles: Obstacles,
-        tau_ext: Float[ArrayLike, " n"] | None,
+        tau_ext: Float[Array, " n"] | None,
     ) -> ControlOutput:
-        """What is sent of an output: itself without a guard.
-
-        Args:
-            out: The controller's own output.
-            arm: The arm's state.
-            obstacles: Obstacle slots.
-            tau_ext: Joint torque of the contacts, (n,) [N m], if known.
-        """
+        """What is sent of an output: itself without a guard."""
         if self.guard is None:
             return out
-        ext = None if tau_ext is None else jnp.asarray(tau_ext)
         tau, found = self.guard(
-            self.robot, arm, out.tau, out.Mq, out.bias, obstacles, ext
+            self.robot, arm, out.tau, out.Mq, out.bias, obstacles, tau_ext
         )
         changed = psd_solve(out.Mq, tau - out.bias)
         return out.replace(

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.control.arguments import check_obstacles, check_setpoint, check_state
 from rmp_mjx.control.avoidance import Surroundings, obstacle_branch, self_branch
 from rmp_mjx.control.contact import ContactResponse, turning_by_contact
 from rmp_mjx.control.controller import ImpedanceController
@@ -25,7 +24,7 @@ from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp import RMP, pullback
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import ArmState, SiteState, arm_state, site_state
+from rmp_mjx.robot.kinematics import ArmState, SiteState, site_state
 from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.xla import materialize
 
@@ -84,26 +83,15 @@ class RMPVICES(ImpedanceController):
         """The same controller with another collision leaf; see `Leaves`."""
         return self.replace(leaves=self.leaves.with_collision(collision))
 
-    def __call__(
+    def unguarded(
         self,
-        q: Float[ArrayLike, " n"],
-        qd: Float[ArrayLike, " n"],
+        arm: ArmState,
         setpoint: Setpoint,
         obstacles: Obstacles,
-        tau_ext: Float[ArrayLike, " n"] | None = None,
-        tau_last: Float[ArrayLike, " n"] | None = None,
+        tau_ext: Float[Array, " n"] | None,
+        tau_last: Float[Array, " n"] | None,
     ) -> ControlOutput:
         """Torque for one state.
-
-        Args:
-            q: Joint positions, (n,) [rad].
-            qd: Joint velocities, (n,) [rad/s].
-            setpoint: Impedance target, from `setpoint`.
-            obstacles: Padded obstacle slots.
-            tau_ext: Joint torque of the contacts, (n,) [N m], measured or from a
-                `ContactObserver`; None: not known.
-            tau_last: Torque of the last control step, (n,) [N m]; None: not known. It
-                matters where the robot has a limit of the torques' rate.
 
         Returns:
             Torque, acceleration, root RMP and diagnostics. These are `torque_limit`,
@@ -111,20 +99,14 @@ class RMPVICES(ImpedanceController):
             limit; `clearance` [m], the least distance of a control point to an
             obstacle; `stop_time` [s], see `torque.stop_time`; and the weights of this
             state, `attractor_weight` and `orientation_weight`, in [0, 1].
-
-        Raises:
-            ValueError: An argument has a wrong shape or dtype.
         """
-        check_state(self.robot.n, q, qd, tau_ext, tau_last)
-        check_setpoint(setpoint)
-        check_obstacles(obstacles)
-        q, qd = jnp.asarray(q), jnp.asarray(qd)
-        arm = arm_state(self.robot, q, qd)
+        q, qd = arm.q, arm.qd
         Mq, bias = dynamics(self.robot, arm)
         w = self._by_contact(Mq, tau_ext)
-        leaves = self.leaves.weighted(setpoint.weights)
-        slowing, stop = self._braking(leaves, Mq, bias, qd, tau_ext)
-        branches, around = self._avoidance(slowing, arm, obstacles, w)
+        load = bias if w is None or tau_ext is None else bias - tau_ext
+        leaves, stop = self._braking(Mq, load, qd)
+        leaves = leaves.weighted(setpoint.weights)
+        branches, around = self._avoidance(leaves, arm, obstacles, w)
         clearance, body_clearance = _nearest(around, arm.p.dtype)
         site = site_state(self.robot, arm)
         if self.dither is not None:
@@ -141,14 +123,14 @@ class RMPVICES(ImpedanceController):
         branches += self._impedance(
             site, setpoint, attractor_weight, orientation_weight, turning
         )
-        if slowing.joint_limit is not None:
-            leaf = slowing.joint_limit
+        if leaves.joint_limit is not None:
+            leaf = leaves.joint_limit
             branches.append(leaf(q, qd) if w is None else leaf.against(q, qd, w))
-        if slowing.posture is not None:
-            branches.append(slowing.posture(q, qd, Mq))
+        if leaves.posture is not None:
+            branches.append(leaves.posture(q, qd, Mq))
         root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
         solution = self.resolve(root, Mq, bias, qd, w, tau_last)
-        out = ControlOutput(
+        return ControlOutput(
             tau=solution.tau,
             qdd=solution.qdd,
             f=root.f,
@@ -163,7 +145,6 @@ class RMPVICES(ImpedanceController):
                 "orientation_weight": orientation_weight,
             },
         )
-        return self.guarded(out, arm, obstacles, tau_ext)
 
     def resolve(
         self,
@@ -199,28 +180,22 @@ class RMPVICES(ImpedanceController):
         return RootSolution(qdd, tau, found)
 
     def _by_contact(
-        self, Mq: Float[Array, "n n"], tau_ext: Float[ArrayLike, " n"] | None
+        self, Mq: Float[Array, "n n"], tau_ext: Float[Array, " n"] | None
     ) -> Float[Array, " n"] | None:
         """Joint acceleration by the contacts, if it is known and counts."""
         if self.contact is None or tau_ext is None:
             return None
-        return self.contact.acceleration(Mq, jnp.asarray(tau_ext))
+        return self.contact.acceleration(Mq, tau_ext)
 
     def _braking(
-        self,
-        leaves: Leaves,
-        Mq: Float[Array, "n n"],
-        bias: Float[Array, " n"],
-        qd: Float[Array, " n"],
-        tau_ext: Float[ArrayLike, " n"] | None,
+        self, Mq: Float[Array, "n n"], load: Float[Array, " n"], qd: Float[Array, " n"]
     ) -> tuple[Leaves, Float[Array, ""]]:
         """The leaves for an arm that needs some time to stop, and that time [s]."""
         if self.braking_share is None:
-            return leaves, jnp.zeros((), Mq.dtype)
-        load = bias if tau_ext is None or self.contact is None else bias - tau_ext
+            return self.leaves, jnp.zeros((), Mq.dtype)
         tau_max = jnp.asarray(self.robot.tau_max)
         time = stop_time(Mq, load, qd, tau_max, self.braking_share)
-        return leaves.braking(time), time
+        return self.leaves.braking(time), time
 
     def _impedance(
         self,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from rmp_mjx.control.arguments import check_obstacles, check_setpoint, check_state
 from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.math import critical_damping, orientation_error, psd_solve
@@ -13,7 +12,7 @@ from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
 from rmp_mjx.rmp.leaves.posture import Posture
 from rmp_mjx.robot.dynamics import dynamics
-from rmp_mjx.robot.kinematics import arm_state, site_state
+from rmp_mjx.robot.kinematics import ArmState, site_state
 from rmp_mjx.types import Action, ControlOutput, Setpoint
 
 
@@ -35,16 +34,15 @@ class VICES(ImpedanceController):
     kq: Float[Constant, ""] | float = 10.0
     """Posture stiffness in the null space [1/s^2]."""
 
-    def __call__(
+    def unguarded(
         self,
-        q: Float[ArrayLike, " n"],
-        qd: Float[ArrayLike, " n"],
+        arm: ArmState,
         setpoint: Setpoint,
         obstacles: Obstacles,
-        tau_ext: Float[ArrayLike, " n"] | None = None,
-        tau_last: Float[ArrayLike, " n"] | None = None,
+        tau_ext: Float[Array, " n"] | None,
+        tau_last: Float[Array, " n"] | None,
     ) -> ControlOutput:
-        """Torque for one state; same signature as `RMPVICES`.
+        """Torque for one state.
 
         It ignores the contacts' torque. The torque's rate is clipped where the robot
         has a limit of it.
@@ -52,15 +50,8 @@ class VICES(ImpedanceController):
         Returns:
             Torque, the acceleration it gives, that acceleration as an RMP in the
             inertia metric, and the diagnostics that all controllers have.
-
-        Raises:
-            ValueError: An argument has a wrong shape or dtype.
         """
-        check_state(self.robot.n, q, qd, tau_ext, tau_last)
-        check_setpoint(setpoint)
-        check_obstacles(obstacles)
-        q, qd = jnp.asarray(q), jnp.asarray(qd)
-        arm = arm_state(self.robot, q, qd)
+        del obstacles, tau_ext
         Mq, bias = dynamics(self.robot, arm)
         site = site_state(self.robot, arm)
         kd_pos, kd_ori = (
@@ -76,12 +67,12 @@ class VICES(ImpedanceController):
         wrench = jnp.concatenate(
             [psd_solve(G[:3, :3], a_pos), psd_solve(G[3:, 3:], a_ori)]
         )
-        qdd_0 = Posture(self.robot.q_home, kq=self.kq).acceleration(q, qd)
+        qdd_0 = Posture(self.robot.q_home, kq=self.kq).acceleration(arm.q, arm.qd)
         null = _dot(Mq, qdd_0) - _dot(J.T, psd_solve(G, _dot(J, qdd_0)))
         dynamic = _dot(J.T, wrench) + null
         low, high = torque_range(self.robot, tau_last, self.period)
         tau, limit = clip_torque(dynamic + bias, low, high)
-        out = ControlOutput(
+        return ControlOutput(
             tau=tau,
             qdd=psd_solve(Mq, dynamic),
             f=dynamic,
@@ -90,7 +81,6 @@ class VICES(ImpedanceController):
             bias=bias,
             diagnostics={"torque_limit": limit},
         )
-        return self.guarded(out, arm, obstacles, tau_ext)
 
 
 def _dot(a: Array, b: Array) -> Array:
