@@ -136,7 +136,7 @@ class ArmEnv(World[OptionsT]):
             info["spheres"],
             action,
             info["control"],
-            self._error(key),
+            self.sphere_error(key),
             self.dt * info["step"],
             jax.random.fold_in(key, 1),
         )
@@ -220,7 +220,7 @@ class ArmEnv(World[OptionsT]):
         spheres = Spheres.start(key_motion, wanted, fits, speed)
         return jnp.where(spheres.placed[:, None], centers, jnp.array(AWAY)), spheres
 
-    def _error(self, key: Array) -> Array:
+    def sphere_error(self, key: Array) -> Array:
         """Error of the spheres' measured positions in a policy step, (k, 3) [m]."""
         noise = jax.random.normal(key, (self.scene.spheres, 3))
         return self.options.obstacle_noise * noise
@@ -243,7 +243,7 @@ class ArmEnv(World[OptionsT]):
         values |= self.observe(data, site, task)
         if self.options.seen_spheres:
             # The measurement that the controller gets in the next step.
-            error = self._error(jax.random.split(rng)[1])
+            error = self.sphere_error(jax.random.split(rng)[1])
             values |= sight.look(
                 self.options.seen_spheres,
                 site,

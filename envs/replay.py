@@ -81,7 +81,7 @@ def policy_step(
     yield Moment("set-point", {k.lstrip("."): np.asarray(v) for k, v in target})
 
     _, key = jax.random.split(info["rng"])
-    error = options.obstacle_noise * jax.random.normal(key, (env.scene.spheres, 3))
+    error = env.sphere_error(key)
     noise = env.noise(jax.random.fold_in(key, 1))
 
     @jax.jit
