@@ -192,6 +192,15 @@ class SafetyRecord(Pytree):
         "max", Metric("joint_jerk", "max", unit="rad/s^3")
     )
     """Greatest jerk of a joint from one physics step to the next [rad/s^3]."""
+    guard_used: Float[Array, ""] = recorded(
+        "mean", Metric("guard_used", "mean", unit="share")
+    )
+    """Share of the torques that was the guard's stop; 0 without a guard."""
+    guard_unproved: Float[Array, ""] = recorded(
+        "mean", Metric("guard_unproved", "mean", unit="share")
+    )
+    """Share of the physics steps in which the guard had no proof, since an assumption
+    did not hold: no stop was proved, or the step was not as predicted."""
     contact_overflow: Bool[Array, ""] = recorded(
         "any",
         Metric(
@@ -259,6 +268,7 @@ def observe(
     motion: Motion,
     torque_limit: Float[Array, " n"],
     change: Float[Array, " n"] | None = None,
+    guarded: tuple[Array, Array] | None = None,
 ) -> SafetyRecord:
     """The record of the physics step that led to `state`.
 
@@ -271,6 +281,8 @@ def observe(
         torque_limit: Not 0 where a torque was at its limit, (n,).
         change: Change of the applied torques in this step, the first of a policy step
             included, (n,) [N m]; for an arm with a limit on their rate.
+        guarded: Share of the guard's stop, and whether the guard had no proof; None
+            without a guard.
 
     Returns:
         The record; what is measured of collisions is for `impacts` to add.
@@ -309,6 +321,8 @@ def observe(
         torque_reversals=torques.reversed.astype(q.dtype),
         joint_speed=jnp.max(jnp.abs(motion.qd)),
         joint_jerk=jnp.max(jnp.abs(motion.jerk)),
+        guard_used=zero if guarded is None else guarded[0].astype(q.dtype),
+        guard_unproved=zero if guarded is None else guarded[1].astype(q.dtype),
         contact_overflow=jnp.any(contacts.overflow),
     )
 

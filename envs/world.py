@@ -267,6 +267,7 @@ class World(Task[OptionsT]):
                 motion := motion.then(data.qvel[:n], self.sim_dt),
                 out.diagnostics["torque_limit"],
                 None if last is None or memory.tau is None else memory.tau - last,
+                _guarded(ctrl, out, data.qvel[:n]),
             )
             moment = impacts.Moment(
                 qpos=before.qpos,
@@ -323,6 +324,23 @@ class World(Task[OptionsT]):
             for gap in self.gaps(data, spheres)
         )
         return functools.reduce(jnp.minimum, nearest)
+
+
+def _guarded(
+    controller: Controller, out: ControlOutput, qd: Float[Array, " n"]
+) -> tuple[Array, Array] | None:
+    """What the controller's guard did, and whether it had no proof; None without one.
+
+    Args:
+        controller: The controller.
+        out: Its output.
+        qd: Joint velocities after the step, (n,) [rad/s].
+    """
+    guard, found = getattr(controller, "guard", None), out.diagnostics
+    if guard is None:
+        return None
+    broken = ~guard.kept(found["guard_qd"], qd) | (found["guard_assumptions"] > 0)
+    return found["guard_used"], broken
 
 
 def _takes(controller: Controller, name: str) -> bool:

@@ -217,3 +217,20 @@ def test_jerk_is_the_second_difference_of_the_velocities():
     # A velocity of 1e-3 in float32 is good to 1e-10, divided by dt^2.
     np.testing.assert_allclose(np.stack(jerks[1:])[:, 0], 2.0, atol=1e-4)
     np.testing.assert_allclose(np.stack(jerks[1:])[:, 1], t[1:-1], atol=1e-4)
+
+
+def test_a_guarded_task_counts_what_its_guard_does(make):
+    """Random full actions among moving spheres: the guard has to act, its assumptions
+    hold while nothing touches, and no first contact begins faster than its speed."""
+    task = make("vices", guard=True, layout="close", obstacle_speed=0.1)
+    state = task.reset(jax.random.split(jax.random.key(5), LANES))
+    used, touched = [], np.zeros(LANES, bool)
+    for key in jax.random.split(jax.random.key(6), 40):
+        action = jax.random.uniform(key, (LANES, 12), minval=-1.0, maxval=1.0)
+        state = task.step(state, jnp.sign(action))
+        found = {k: np.asarray(v) for k, v in state.metrics.items()}
+        used.append(found["guard_used"])
+        assert found["contact_speed"][~touched].max() <= task.env.controller.guard.speed
+        touched |= found["contact_force_peak"] > 0.0
+        assert np.all(found["guard_unproved"][~touched] == 0.0)
+    assert 0.0 < np.mean(used) < 1.0
