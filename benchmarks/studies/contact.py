@@ -1,8 +1,9 @@
 """Trained policies where contact, weak motors and moving spheres matter, part by part.
 
-Each column is a world, each line a controller: the default one, and ones with a part
-taken away. Every cell is a number of whole episodes under the mean action, the same
-starts in every line. Run as
+Each column is a world, each line a controller: the default one, ones with a part taken
+away, the guarded one, and others. Every cell is a number of whole episodes under the
+mean action, the same starts in every line. What went before each event of the default
+controller is counted too. Run as
 ``python -m benchmarks.contact --json FILE --docs docs/ablation.md``.
 """
 
@@ -22,8 +23,7 @@ from benchmarks.studies.failures import share
 from benchmarks.studies.random_policies import Clipped
 from benchmarks.studies.safety_study import ENDING, Group, Study
 from envs.cli import load_config
-from rmp_mjx import RMPVICES, VICES, runtime
-from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx import RMPVICES, runtime
 from rmp_mjx.training.policy import load_policy
 
 Figures = dict[str, np.ndarray]
@@ -87,12 +87,37 @@ PARTS: dict[str, tuple[str, Callable[[RMPVICES], RMPVICES]]] = {
 }
 """Controllers by name: what they are in words, and how they are made."""
 
-OTHERS = {
-    "clipped": ("all, but torques clipped instead of the root limited", Clipped),
-    "vices": ("VICES", VICES),
-    "vices_cbf": ("VICES behind the CBF filter", FilteredVICES),
+OTHERS: dict[str, tuple[str, str | type[Clipped], dict[str, Any]]] = {
+    "clipped": ("all, but torques clipped instead of the root limited", Clipped, {}),
+    "guarded": ("all, behind the guard", "rmp_vices", {"guard": True}),
+    "vices": ("VICES", "vices", {}),
+    "vices_cbf": ("VICES behind the CBF filter", "vices_cbf", {}),
 }
-"""Controllers that need a program of their own."""
+"""Controllers that need a program of their own: words, kind, options of the task."""
+
+WORKING = 30.0
+"""Mean force of the hand on its object above which it counts as at work [N]."""
+
+CAUSES: dict[str, tuple[str, Callable[[Figures], np.ndarray]]] = {
+    "still": (
+        "a sphere came; the arm moved towards it at 1 cm/s at most",
+        lambda now: (now["obstacle_collision"] > 0) & (now["at_fault"] == 0),
+    ),
+    "weak": (
+        "a motor at its limit in half of the steps",
+        lambda now: now["torque_saturation"] >= 0.5,
+    ),
+    "work": (
+        "the hand pressed on its object with 30 N",
+        lambda now: now["work_force"] >= WORKING,
+    ),
+    "sphere": ("else, at a sphere", lambda now: now["obstacle_collision"] > 0),
+    "fixture": ("else, at table, fixture or object", lambda now: now["collision"] > 0),
+    "else": ("joint limit or another link", lambda now: now["age"] > 0),
+}
+"""What went before an event, the first that is true: words, and whether it is. The
+figures are those of the event's policy step; of its forces and torques, the greater of
+that step and the one before."""
 
 
 def judge(figures: Figures) -> Figures:
@@ -108,6 +133,24 @@ def judge(figures: Figures) -> Figures:
         "event": np.any(np.stack([ever(name) for name in ENDING]), axis=0),
         "at_fault": ever("at_fault"),
     }
+
+
+def causes(figures: Figures) -> dict[str, int]:
+    """How many of the first events of the worlds have which cause."""
+    over = np.cumsum(figures["over"].astype(bool), axis=0) > 0
+    event = np.any(np.stack([figures[name] > 0 for name in ENDING]), axis=0)
+    event[1:] &= ~over[:-1]
+    worlds = np.flatnonzero(event.any(axis=0))
+    first = event.argmax(axis=0)[worlds]
+    now = {name: values[first, worlds] for name, values in figures.items()}
+    for name in ("torque_saturation", "work_force"):
+        before = figures[name][np.maximum(first - 1, 0), worlds]
+        now[name] = np.maximum(now[name], before)
+    left, found = np.ones(len(worlds), bool), {}
+    for name, (_, holds) in CAUSES.items():
+        hits = left & holds(now)
+        found[name], left = int(hits.sum()), left & ~hits
+    return found
 
 
 def rows_of(key: str, judged: Figures) -> list[Row]:
@@ -146,17 +189,15 @@ def measure(
         }
         for kinds in _programs(lines):
             began = time.perf_counter()
-            controller = "rmp_vices" if kinds[0] in PARTS else OTHERS[kinds[0]][1]
-            if not isinstance(controller, str):
-                controller = controller(sample.robot)
+            _, kind, more = OTHERS.get(kinds[0], ("", "rmp_vices", {}))
             study = Study(
-                controller,
+                kind if isinstance(kind, str) else kind(sample.robot),
                 list(groups.values()),
                 sample.episode_length,
                 task=task,
                 agent=agent,
                 restart=False,
-                **options,
+                **options | more,
             )
             for line in kinds:
                 made = study.env.controller
@@ -165,7 +206,13 @@ def measure(
                     made = PARTS[line][1](made)
                 found = study.run(made, seed)
                 for name, group in groups.items():
-                    rows += rows_of(f"{task}/{name}/{line}", judge(found[group]))
+                    key, figures = f"{task}/{name}/{line}", found[group]
+                    rows += rows_of(key, judge(figures))
+                    if line == "all":
+                        counts = causes(figures).items()
+                        rows += [
+                            Row(f"{key}/{why}", n, "", "events") for why, n in counts
+                        ]
             took = time.perf_counter() - began
             print(f"{task}, {', '.join(names)}, {', '.join(kinds)}: {took:.0f} s")
     return rows
@@ -192,6 +239,17 @@ def table(task: str, worlds: list[str], lines: list[str], rows: list[Row]) -> st
     words: Mapping[str, Any] = PARTS | OTHERS
     head = (task, *(WORLDS[name].title for name in worlds))
     return markdown(head, [(words[n][0], *(cell(w, n) for w in worlds)) for n in lines])
+
+
+def cause_table(task: str, worlds: list[str], rows: list[Row]) -> str:
+    """How many events of all parts together have which cause."""
+    value = {row.key: row.value for row in rows}
+    head = (f"{task}: events of all parts", *(WORLDS[name].title for name in worlds))
+    lines = [
+        (words, *(f"{value[f'{task}/{world}/all/{why}']:.0f}" for world in worlds))
+        for why, (words, _) in CAUSES.items()
+    ]
+    return markdown(head, lines)
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
@@ -231,7 +289,11 @@ def main(argv: list[str] | None = None) -> None:
         show(rows, task)
         if args.json:
             write_json(args.json, rows, **settings)
-    tables = [table(task, args.worlds, args.lines, rows) for task in args.tasks]
+    tables = []
+    for task in args.tasks:
+        tables.append(table(task, args.worlds, args.lines, rows))
+        if "all" in args.lines:
+            tables.append(cause_table(task, args.worlds, rows))
     text = "\n\n".join(tables)
     print(text)
     if args.docs:
