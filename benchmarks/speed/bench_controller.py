@@ -74,6 +74,15 @@ def random_states(robot: rmp.Robot, batch: int, seed: int):
     )
 
 
+class InContact(rmp.RMPVICES):
+    """RMP-VICES with a joint torque of contacts at every call."""
+
+    def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
+        """Torque for one state."""
+        felt = 5.0 * jnp.sin(q) if tau_ext is None else tau_ext  # some torque [N m]
+        return super().__call__(q, qd, setpoint, obstacles, felt, tau_last)
+
+
 def throughput(
     ctrl: rmp.RMPVICES | rmp.VICES, batch: int, seed: int, seconds: float
 ) -> tuple[Row, ...]:
@@ -120,6 +129,7 @@ def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
     named = [
         ("controller", "", rmp.RMPVICES(robot)),
         ("vices", "", rmp.VICES(robot)),
+        ("controller", "_in_contact", InContact(robot)),
         ("controller", "_guarded", rmp.RMPVICES(robot, guard=guard)),
     ]
     if autodiff:
