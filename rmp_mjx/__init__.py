@@ -27,6 +27,7 @@ from rmp_mjx.rmp import resolve as resolve
 from rmp_mjx.robot import Robot as Robot
 from rmp_mjx.robot import RobotError as RobotError
 from rmp_mjx.robot import RobotWarning as RobotWarning
+from rmp_mjx.robot import robots as robots
 from rmp_mjx.types import Action as Action
 from rmp_mjx.types import ControlOutput as ControlOutput
 from rmp_mjx.types import LeafWeights as LeafWeights

@@ -8,6 +8,7 @@ from flax import struct
 from jaxtyping import Float
 
 from rmp_mjx.pytree import Pytree
+from rmp_mjx.robot.enclose import Capsule, enclosing_capsules
 from rmp_mjx.types import Constant
 
 
@@ -50,10 +51,10 @@ class ControlPoints(Pytree):
 
 
 def body_capsules(model, data, segment, frames_p, frames_R, carriers):
-    """Enclose every colliding geom of the carrier bodies in a capsule.
+    """Enclose every colliding geom of the carrier bodies in capsules.
 
-    Capsules and spheres are taken as they are; any other geom is enclosed by the
-    capsule around the longest axis of its bounding box.
+    Capsules and spheres are taken as they are. Capsules are fitted to the hull of any
+    other geom, see `enclose`.
 
     Returns:
         The capsules, and the body name of each.
@@ -64,16 +65,16 @@ def body_capsules(model, data, segment, frames_p, frames_R, carriers):
         collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
         if body not in carriers or not collides:
             continue
-        start, end, radius = _enclosing_capsule(model, data, geom)
         k = int(segment[body])
-        if k >= 0:
-            start, end = ((x - frames_p[k]) @ frames_R[k] for x in (start, end))
-        starts.append(start)
-        ends.append(end)
-        radii.append(radius)
-        segments.append(k)
-        geoms.append(model.geom(geom).name)
-        bodies.append(model.body(body).name)
+        for start, end, radius in _capsules_of(model, data, geom):
+            if k >= 0:
+                start, end = ((x - frames_p[k]) @ frames_R[k] for x in (start, end))
+            starts.append(start)
+            ends.append(end)
+            radii.append(radius)
+            segments.append(k)
+            geoms.append(model.geom(geom).name)
+            bodies.append(model.body(body).name)
     capsules = Capsules(
         start=np.reshape(starts, (-1, 3)),
         end=np.reshape(ends, (-1, 3)),
@@ -84,19 +85,47 @@ def body_capsules(model, data, segment, frames_p, frames_R, carriers):
     return capsules, bodies
 
 
-def _enclosing_capsule(model, data, geom):
+def _capsules_of(model, data, geom) -> list[Capsule]:
+    """Capsules in the world that enclose a geom."""
     centre, R = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
     size, kind = model.geom_size[geom], model.geom_type[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return centre, centre, size[0]
+        return [Capsule(centre, centre, size[0])]
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         axis = R[:, 2] * size[1]
-        return centre - axis, centre + axis, size[0]
-    box_centre, half = np.split(model.geom_aabb[geom], 2)
-    centre = centre + R @ box_centre
-    long = int(np.argmax(half))
-    axis = R[:, long] * half[long]
-    return centre - axis, centre + axis, float(np.linalg.norm(np.delete(half, long)))
+        return [Capsule(centre - axis, centre + axis, size[0])]
+    return [
+        Capsule(centre + R @ start, centre + R @ end, radius)
+        for start, end, radius in enclosing_capsules(hull_corners(model, geom))
+    ]
+
+
+_RIM = 32
+"""Corners of the polygon round a cylinder's rim."""
+
+
+def hull_corners(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
+    """Points whose hull contains a geom, in the geom's frame [m].
+
+    They are a mesh's vertices, the corners of polygons round a cylinder's rims, and the
+    corners of the bounding box of anything else.
+    """
+    kind = model.geom_type[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        return model.mesh_vert[first : first + count].astype(float)
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        radius, half = model.geom_size[geom, :2]
+        angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
+        rim = np.stack([np.cos(angle), np.sin(angle)], 1) * radius
+        rim /= np.cos(np.pi / _RIM)  # round the circle
+        return np.concatenate(
+            [np.column_stack([rim, np.full(_RIM, z)]) for z in (-half, half)]
+        )
+    centre, half = np.split(model.geom_aabb[geom], 2)
+    return centre + signs * half
 
 
 def sample_control_points(
@@ -131,34 +160,3 @@ def sample_control_points(
         segment=tuple(segment),
         body=tuple(body),
     )
-
-
-def touching_pairs(
-    model: mujoco.MjModel, capsules: Capsules, samples: int = 2000
-) -> tuple[tuple[int, int], ...]:
-    """Capsule pairs that self-collision has to watch.
-
-    They are at least three joints apart (nearer ones touch by construction or are kept
-    apart by a joint limit) and come within 2 cm of each other in one of `samples`
-    configurations drawn within the joint limits (fixed seed).
-    """
-    candidates = [
-        (far, near)
-        for far, k in enumerate(capsules.segment)
-        for near, j in enumerate(capsules.segment)
-        if k - j >= 3
-    ]
-    limited = model.jnt_limited.astype(bool)
-    low = np.where(limited, model.jnt_range[:, 0], -np.pi)
-    high = np.where(limited, model.jnt_range[:, 1], np.pi)
-    data = mujoco.MjData(model)
-    ids = [model.geom(name).id for name in capsules.geom]
-    touching: set[tuple[int, int]] = set()
-    for q in np.random.default_rng(0).uniform(low, high, (samples, model.nq)):
-        data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)
-        for far, near in set(candidates) - touching:
-            gap = mujoco.mj_geomDistance(model, data, ids[far], ids[near], 0.1, None)
-            if gap < 0.02:
-                touching.add((far, near))
-    return tuple(pair for pair in candidates if pair in touching)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,18 @@ from jaxtyping import Float
 
 from rmp_mjx.names import unknown
 from rmp_mjx.pytree import Pytree
+from rmp_mjx.robot.configurations import touching_pairs
 from rmp_mjx.robot.control_points import (
     Capsules,
     ControlPoints,
     body_capsules,
     sample_control_points,
-    touching_pairs,
 )
 from rmp_mjx.robot.end_effector import end_effector
-from rmp_mjx.robot.errors import Numbers, RobotError, positive, vector
+from rmp_mjx.robot.errors import Numbers, RobotError, vector
 from rmp_mjx.robot.fingerprint import fingerprint
+from rmp_mjx.robot.library import find
+from rmp_mjx.robot.limits import rated
 from rmp_mjx.robot.links import carriers, frame_with_z, lumped_inertias, segments
 from rmp_mjx.robot.mjcf import (
     compile_spec,
@@ -166,31 +167,34 @@ class Robot(Pytree):
         ]
 
     @staticmethod
-    def load(name: str = "jaco2", armature: str = "physical", **kwargs) -> Robot:
-        """Load a robot that ships with the library.
+    def load(
+        name: str = "jaco2", armature: str | Numbers = "physical", **kwargs: Any
+    ) -> Robot:
+        """Load an arm by its name, or from a file.
 
         Args:
-            name: `jaco2`.
-            armature: `physical` (geared actuators, the default) or `robosuite`, which
-                adds 5/(i+1) kg m^2 to joint i and so dominates the arm's inertia.
-            **kwargs: Passed to `from_mjcf` (for instance `spacing`). Unlike there,
-                `compensate_passive` is off: the small damping of the Jaco's joints
-                stands for losses that a controller does not know.
+            name: One of `rmp_mjx.robots`, a path of an MJCF, or a path of a file of
+                parameters (`.toml`), which `python -m rmp_mjx.check_robot` writes.
+            armature: Rotor inertias: `physical` for the file's own, or numbers that
+                replace them, (n,) [kg m^2]. The Jaco 2 has `robosuite`, too, which adds
+                5/(i+1) kg m^2 to joint i and so dominates the arm's inertia.
+            **kwargs: Passed to `from_mjcf` (for instance `spacing`), over what the name
+                or the file of parameters says.
 
         Raises:
-            RobotError: Unknown name or armature setting.
+            RobotError: Unknown name or armature setting; and what `from_mjcf` raises.
         """
-        if name != "jaco2":
-            raise RobotError(unknown("robot", name, ["jaco2"]))
-        if armature not in ARMATURE:
-            raise RobotError(unknown("armature setting", armature, list(ARMATURE)))
-        path = resources.files("rmp_mjx.robot") / "jaco2" / "jaco2.xml"
-        options: dict[str, Any] = {
-            "site": "grip",
-            "armature": ARMATURE[armature],
-            "compensate_passive": False,
-        }
-        return Robot.from_mjcf(str(path), **options | kwargs)
+        path, options = find(name)
+        if isinstance(armature, str):
+            if armature not in ARMATURE:
+                raise RobotError(unknown("armature setting", armature, list(ARMATURE)))
+            if armature != "physical":
+                options = options | {"armature": ARMATURE[armature]}
+        else:
+            options = options | {"armature": armature}
+        if "site" in kwargs or "body" in kwargs:
+            options = {k: v for k, v in options.items() if k not in ("site", "body")}
+        return Robot.from_mjcf(path, **options | kwargs)
 
     @staticmethod
     def from_mjcf(
@@ -224,8 +228,8 @@ class Robot(Pytree):
             offset: End effector's position in that body's frame, (3,) [m].
             armature: Rotor inertias that replace the file's, (n,) [kg m^2].
             torque_limits: Actuator limits that replace the file's, (n,) [N m or N].
-            velocity_limits: Limits of the joint speeds, (n,) [rad/s or m/s]; MJCF has
-                none, so that the default is none.
+            velocity_limits: Limits of the joint speeds, (n,) [rad/s or m/s]; default
+                the file's custom numbers of this name, else none.
             torque_rate_limits: Limits of the torques' rates, (n,) [N m/s or N/s];
                 likewise.
             q_home: Nominal posture, (n,) [rad or m]; default keyframe `home`, else the
@@ -277,7 +281,7 @@ class Robot(Pytree):
         R_last = frames_R[-1]
         prev_p = np.vstack([np.zeros(3), frames_p[:-1]])
         prev_R = np.concatenate([np.eye(3)[None], frames_R[:-1]])
-        return Robot(
+        robot = Robot(
             offset=np.einsum("nji,nj->ni", prev_R, frames_p - prev_p),
             rotation=np.einsum("nji,njk->nik", prev_R, frames_R),
             q_ref=q_ref,
@@ -285,12 +289,10 @@ class Robot(Pytree):
             q_lower=lower,
             q_upper=upper,
             tau_max=model.actuator_ctrlrange[:, 1].copy(),
-            qd_max=None
-            if velocity_limits is None
-            else positive("velocity_limits", velocity_limits, len(joints)),
-            tau_rate_max=None
-            if torque_rate_limits is None
-            else positive("torque_rate_limits", torque_rate_limits, len(joints)),
+            qd_max=rated(model, "velocity_limits", velocity_limits, len(joints)),
+            tau_rate_max=rated(
+                model, "torque_rate_limits", torque_rate_limits, len(joints)
+            ),
             mass=mass,
             com=com,
             inertia=inertia,
@@ -301,7 +303,7 @@ class Robot(Pytree):
             points=sample_control_points(
                 model, data, capsules, bodies, frames_p, frames_R, spacing
             ),
-            capsules=capsules.replace(pairs=touching_pairs(model, capsules)),
+            capsules=capsules,
             hinge=tuple(
                 bool(model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE) for j in ids
             ),
@@ -313,3 +315,4 @@ class Robot(Pytree):
             assets=assets,
             **passive._asdict(),
         )
+        return robot.replace(capsules=capsules.replace(pairs=touching_pairs(robot)))

@@ -249,7 +249,7 @@ REFUSALS = {
     ),
     "unknown robot": (
         lambda: Robot.load("jaco3"),
-        "unknown robot 'jaco3'; valid names: jaco2. Did you mean 'jaco2'?",
+        "unknown robot 'jaco3'; valid names: jaco2, panda, fr3, ur5e, iiwa14, planar3",
     ),
     "unknown armature setting": (
         lambda: Robot.load(armature="physcal"),

@@ -1,0 +1,111 @@
+"""Random configurations of an arm, and how far it is from itself in them (NumPy)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from rmp_mjx.robot.model import Robot
+
+
+def random_configurations(
+    robot: Robot, count: int, seed: int = 0
+) -> Float[np.ndarray, "s n"]:
+    """Joint coordinates [rad or m], even within the limits; +-pi where there is none."""
+    low = np.where(np.isfinite(robot.q_lower), robot.q_lower, -np.pi)
+    high = np.where(np.isfinite(robot.q_upper), robot.q_upper, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (count, robot.n))
+
+
+def joint_frames(
+    robot: Robot, q: Float[np.ndarray, "s n"]
+) -> tuple[Float[np.ndarray, "n s 3"], Float[np.ndarray, "n s 3 3"]]:
+    """World positions [m] and orientations of the joint frames in s configurations."""
+    p, R = np.zeros((len(q), 3)), np.tile(np.eye(3), (len(q), 1, 1))
+    origins, rotations = [], []
+    for j in range(robot.n):
+        p, R = p + R @ robot.offset[j], R @ robot.rotation[j]
+        shift = q[:, j] - robot.q_ref[j]
+        if robot.hinge[j]:
+            c, s = np.cos(shift)[:, None], np.sin(shift)[:, None]
+            x, y, z = np.moveaxis(R, -1, 0)
+            R = np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+        else:
+            p = p + R[..., 2] * shift[:, None]
+        origins.append(p)
+        rotations.append(R)
+    return np.stack(origins), np.stack(rotations)
+
+
+def capsule_gaps(
+    robot: Robot, q: Float[np.ndarray, "s n"], pairs: Sequence[tuple[int, int]]
+) -> Float[np.ndarray, "s k"]:
+    """Distances of the surfaces of k pairs of capsules in s configurations [m].
+
+    Negative where they overlap.
+    """
+    p, R = joint_frames(robot, q)
+    capsules = robot.capsules
+
+    def in_world(points: np.ndarray, c: int) -> np.ndarray:
+        k = capsules.segment[c]
+        if k < 0:
+            return np.broadcast_to(points[c], (len(q), 3))
+        return p[k] + R[k] @ points[c]
+
+    used = {c for pair in pairs for c in pair}
+    start = {c: in_world(np.asarray(capsules.start), c) for c in used}
+    end = {c: in_world(np.asarray(capsules.end), c) for c in used}
+    gaps = np.empty((len(q), len(pairs)))
+    for i, (a, b) in enumerate(pairs):
+        apart = segment_distance(start[a], end[a], start[b], end[b])
+        gaps[:, i] = apart - capsules.radius[a] - capsules.radius[b]
+    return gaps
+
+
+def segment_distance(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray
+) -> np.ndarray:
+    """Least distances of the segments from a to b and c to d, all (s, 3), (s,) [m].
+
+    The nearest points are inside of both, where the lines are nearest, or one of them
+    is an end.
+    """
+    u, v, w = b - a, d - c, a - c
+    uu, uv, vv = ((x * y).sum(-1) for x, y in ((u, u), (u, v), (v, v)))
+    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
+    cross = uu * vv - uv**2
+    s = np.clip((uv * vw - vv * uw) / np.where(cross > 1e-12, cross, 1.0), 0.0, 1.0)
+    inner = _to_segment(a + s[:, None] * u, c, d)
+    ends = [_to_segment(*x) for x in ((a, c, d), (b, c, d), (c, a, b), (d, a, b))]
+    return np.minimum.reduce([inner, *ends])
+
+
+def _to_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distances of points (s, 3) from the segments from a to b, (s,)."""
+    u = b - a
+    square = np.maximum((u * u).sum(-1), 1e-24)
+    t = np.clip(((x - a) * u).sum(-1) / square, 0.0, 1.0)
+    return np.linalg.norm(x - a - t[:, None] * u, axis=-1)
+
+
+def touching_pairs(robot: Robot, samples: int = 2000) -> tuple[tuple[int, int], ...]:
+    """Capsule pairs that self-collision has to watch.
+
+    They are at least three joints apart (nearer ones touch by construction or are kept
+    apart by a joint limit) and come within 2 cm of each other in one of `samples`
+    configurations drawn within the joint limits (fixed seed).
+    """
+    candidates = [
+        (far, near)
+        for far, k in enumerate(robot.capsules.segment)
+        for near, j in enumerate(robot.capsules.segment)
+        if k - j >= 3
+    ]
+    gaps = capsule_gaps(robot, random_configurations(robot, samples), candidates)
+    near = gaps.min(axis=0) < 0.02
+    return tuple(pair for pair, close in zip(candidates, near, strict=True) if close)
