@@ -21,7 +21,7 @@ from rmp_mjx.control.root import Rows, solve_root
 from rmp_mjx.control.torque import clip_torque, speed_range, stop_time, torque_range
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
-from rmp_mjx.rmp import RMP, pullback
+from rmp_mjx.rmp import RMP, Leaf, Node, Siblings, evaluate, pullback
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, SiteState, site_state
@@ -73,6 +73,8 @@ class RMPVICES(ImpedanceController):
     braking_share: Float[Constant, ""] | float | None = 0.7
     """Share of the motors' torque that the safety leaves count on for braking. The
     less, the earlier they brake. None: they do not look at the motors."""
+    extra: tuple[Node | Siblings | Leaf, ...] = ()
+    """Branches of your own on the joints, beside those of the library."""
 
     def __post_init__(self):
         """Fill in the default leaves, which depend on the robot."""
@@ -128,6 +130,7 @@ class RMPVICES(ImpedanceController):
             branches.append(leaf(q, qd) if w is None else leaf.against(q, qd, w))
         if leaves.posture is not None:
             branches.append(leaves.posture(q, qd, Mq))
+        branches += [evaluate(branch, q, qd, w) for branch in self.extra]
         root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
         solution = self.resolve(root, Mq, bias, qd, w, tau_last)
         return ControlOutput(

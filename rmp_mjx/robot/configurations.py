@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def random_configurations(
     robot: Robot, count: int, seed: int = 0
 ) -> Float[np.ndarray, "s n"]:
-    """Joint coordinates [rad or m], even within the limits; +-pi where there is none."""
+    """Joint coordinates [rad or m], even within the limits or, without any, +-pi."""
     low = np.where(np.isfinite(robot.q_lower), robot.q_lower, -np.pi)
     high = np.where(np.isfinite(robot.q_upper), robot.q_upper, np.pi)
     return np.random.default_rng(seed).uniform(low, high, (count, robot.n))
