@@ -35,6 +35,8 @@ LAW = {
     "sim": BASE | {"obstacles", "robot", "runtime"},
     "training": GROUND | {"types", "runtime", "files"},
     "report": {"files", "training"},
+    "check_robot": BASE
+    | {"rmp", "shapes", "obstacles", "robot", "control", "sim", "runtime", "files"},
     "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
 }
 # The rooms inside `training`, each with those that it may import.
@@ -48,7 +50,7 @@ TRAINING = {
     "brax": {"config", "learning", "policy", "runs"},
 }
 TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}
-KNOW_MUJOCO = {"robot", "sim"}
+KNOW_MUJOCO = {"robot", "sim", "check_robot"}
 # where tasks and training meet
 COMMAND_LINE = {
     f"envs.{name}" for name in ("cli", "export", "flags", "grid", "replay", "results")

@@ -1,19 +1,19 @@
-"""Random configurations of an arm, and how far it is from itself in them (NumPy)."""
+"""Random configurations of an arm, and how far it is from itself in them (NumPy).
+
+`robot` is a `Robot` everywhere.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-if TYPE_CHECKING:
-    from rmp_mjx.robot.model import Robot
-
 
 def random_configurations(
-    robot: Robot, count: int, seed: int = 0
+    robot: Any, count: int, seed: int = 0
 ) -> Float[np.ndarray, "s n"]:
     """Joint coordinates [rad or m], even within the limits or, without any, +-pi."""
     low = np.where(np.isfinite(robot.q_lower), robot.q_lower, -np.pi)
@@ -22,7 +22,7 @@ def random_configurations(
 
 
 def joint_frames(
-    robot: Robot, q: Float[np.ndarray, "s n"]
+    robot: Any, q: Float[np.ndarray, "s n"]
 ) -> tuple[Float[np.ndarray, "n s 3"], Float[np.ndarray, "n s 3 3"]]:
     """World positions [m] and orientations of the joint frames in s configurations."""
     p, R = np.zeros((len(q), 3)), np.tile(np.eye(3), (len(q), 1, 1))
@@ -42,7 +42,7 @@ def joint_frames(
 
 
 def capsule_gaps(
-    robot: Robot, q: Float[np.ndarray, "s n"], pairs: Sequence[tuple[int, int]]
+    robot: Any, q: Float[np.ndarray, "s n"], pairs: Sequence[tuple[int, int]]
 ) -> Float[np.ndarray, "s k"]:
     """Distances of the surfaces of k pairs of capsules in s configurations [m].
 
@@ -93,7 +93,7 @@ def _to_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(x - a - t[:, None] * u, axis=-1)
 
 
-def touching_pairs(robot: Robot, samples: int = 2000) -> tuple[tuple[int, int], ...]:
+def touching_pairs(robot: Any, samples: int = 2000) -> tuple[tuple[int, int], ...]:
     """Capsule pairs that self-collision has to watch.
 
     They are at least three joints apart (nearer ones touch by construction or are kept

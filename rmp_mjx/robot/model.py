@@ -185,16 +185,15 @@ class Robot(Pytree):
             RobotError: Unknown name or armature setting; and what `from_mjcf` raises.
         """
         path, options = find(name)
+        rotors: dict[str, Any] = {"armature": armature}
         if isinstance(armature, str):
             if armature not in ARMATURE:
                 raise RobotError(unknown("armature setting", armature, list(ARMATURE)))
-            if armature != "physical":
-                options = options | {"armature": ARMATURE[armature]}
-        else:
-            options = options | {"armature": armature}
+            replaced = ARMATURE[armature]
+            rotors = {} if replaced is None else {"armature": replaced}
         if "site" in kwargs or "body" in kwargs:
             options = {k: v for k, v in options.items() if k not in ("site", "body")}
-        return Robot.from_mjcf(path, **options | kwargs)
+        return Robot.from_mjcf(path, **options | rotors | kwargs)
 
     @staticmethod
     def from_mjcf(

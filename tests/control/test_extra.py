@@ -49,6 +49,7 @@ def outputs():
         return jax.vmap(both)(push)
 
     plain, windy = run()
+    assert calm.contact is not None
     w = [calm.contact.acceleration(plain.Mq[0], tau) for tau in push]
     return q, qd, w, plain, windy
 

@@ -158,7 +158,7 @@ def test_limits_survive_the_arms_own_text_and_can_be_replaced(arms):
     again = Robot.from_mjcf(arms["fr3"].mjcf, "ee", q_home=arms["fr3"].q_home)
     assert again == arms["fr3"]
     slow = Robot.load("fr3", velocity_limits=[1.0] * 7)
-    assert slow.qd_max.tolist() == [1.0] * 7
+    np.testing.assert_array_equal(slow.qd_max, [1.0] * 7)
 
 
 def test_a_files_limits_must_be_one_positive_number_for_each_joint():
