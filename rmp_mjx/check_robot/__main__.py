@@ -29,6 +29,7 @@ from rmp_mjx.check_robot.reaches import (
     run_reaches,
 )
 from rmp_mjx.robot import Robot, RobotError, RobotWarning, robots
+from rmp_mjx.robot.limits import recorded
 
 _NUMBERS = ("torque_limits", "velocity_limits", "torque_rate_limits", "q_home")
 _EPILOG = "Names of arms here: {}. A .toml file of --out may stand for MODEL, too."
@@ -138,7 +139,7 @@ def _motion(robot: Robot, draws: Draws, track: Track) -> Table:
     table.add_row("contacts with the sphere", str(np.count_nonzero(track.touched)))
     table.add_row("self-collisions", str(np.count_nonzero(track.crossed)))
     table.add_row(f"a joint within {FROM_END} of its end", str(np.count_nonzero(ends)))
-    limits = _record(robot)
+    limits = recorded(robot.mj_model)
     for what, seen, limit in (
         ("speed", track.speed, robot.qd_max),
         ("acceleration", track.acceleration, limits.get("acceleration_limits")),
@@ -152,13 +153,6 @@ def _motion(robot: Robot, draws: Draws, track: Track) -> Table:
     limited = float(np.mean(track.limited)) * PERIOD / DURATION
     table.add_row("time with a motor at its limit", f"{limited:.1%}")
     return table
-
-
-def _record(robot: Robot) -> dict[str, np.ndarray]:
-    """Custom numbers of the arm's file by name."""
-    model = robot.mj_model
-    found = [model.numeric(k) for k in range(model.nnumeric)]
-    return {numeric.name: np.array(numeric.data) for numeric in found}
 
 
 def _share(flags: np.ndarray) -> str:

@@ -19,6 +19,7 @@ from rmp_mjx.check_robot.reaches import (
 from rmp_mjx.control import Leaves
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.configurations import capsule_gaps
+from rmp_mjx.robot.limits import recorded
 
 THICK = 2.6
 """A link's capsules are called thick from this many times its hull's volume."""
@@ -109,6 +110,13 @@ def about_motion(robot: Robot, draws: Draws, track: Track) -> Iterator[str]:
         )
     elif np.any(track.speed.max(axis=0) > 1.1 * robot.qd_max):
         yield "a joint ran at more than 1.1 of its velocity limit"
+    limit = recorded(robot.mj_model).get("acceleration_limits")
+    if limit is not None and np.any(track.acceleration.max(axis=0) > 1.1 * limit):
+        most = np.max(track.acceleration.max(axis=0) / limit)
+        yield (
+            f"joints accelerate with up to {most:.1f} times the file's limit, which no "
+            "controller keeps: lower torque_rate_limits= and stiffness help"
+        )
     if robot.tau_rate_max is None:
         yield "no limits of the torques' rates are known: give torque_rate_limits="
     if float(np.mean(track.limited)) > 0.1 * DURATION / PERIOD:

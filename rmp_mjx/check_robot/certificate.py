@@ -49,7 +49,7 @@ def certify(robot: Robot) -> dict[str, dict[str, float]]:
     ours = _ours(robot, q, qd)
     theirs = {"MuJoCo C": _mujoco(robot, q, qd)}
     if importlib.util.find_spec("pinocchio") is not None and not robot.assets:
-        theirs["Pinocchio"] = _pinocchio(robot, q, qd)
+        theirs["Pinocchio"] = _pinocchio(robot, q, qd, ours)
     return {
         engine: {
             name: float(np.max(np.abs(a - b)) / max(np.max(np.abs(b)), 1e-9))
@@ -90,15 +90,22 @@ def _mujoco(robot: Robot, q: np.ndarray, qd: np.ndarray) -> Terms:
     return Terms(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _pinocchio(robot: Robot, q: np.ndarray, qd: np.ndarray) -> Terms:
-    """Pinocchio reads the arm's own text; it knows no dampers and springs."""
+def _pinocchio(robot: Robot, q: np.ndarray, qd: np.ndarray, ours: Terms) -> Terms:
+    """Pinocchio reads the arm's own text; it knows no dampers and springs.
+
+    It leaves out the pose of a fixed base: our first state says what that is.
+    """
     pin = importlib.import_module("pinocchio")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.xml"
         path.write_text(robot.mjcf)
         model = pin.buildModelFromMJCF(str(path))
-    model.gravity.linear[:] = robot.gravity
     data, frame = model.createData(), model.getFrameId(robot.site_name)
+    pin.framesForwardKinematics(model, data, q[0])
+    pose = data.oMf[frame]
+    turn = ours.rotation[0] @ pose.rotation.T
+    shift = ours.position[0] - turn @ pose.translation
+    model.gravity.linear[:] = turn.T @ robot.gravity
     rows = []
     for q_k, qd_k in zip(q, qd, strict=True):
         pin.computeAllTerms(model, data, q_k, qd_k)
@@ -107,7 +114,8 @@ def _pinocchio(robot: Robot, q: np.ndarray, qd: np.ndarray) -> Terms:
         Mq = np.triu(data.M) + np.triu(data.M, 1).T
         pose = data.oMf[frame]
         bias = data.nle + _hold_passive(robot, q_k, qd_k)
-        rows.append((pose.translation.copy(), pose.rotation.copy(), J, Mq, bias))
+        x, R = shift + turn @ pose.translation, turn @ pose.rotation
+        rows.append((x, R, np.kron(np.eye(2), turn) @ J, Mq, bias))
     return Terms(*(np.array(column) for column in zip(*rows, strict=True)))
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot.enclose import Capsule, enclosing_capsules
+from rmp_mjx.robot.errors import warn
 from rmp_mjx.types import Constant
 
 
@@ -54,16 +55,23 @@ def body_capsules(model, data, segment, frames_p, frames_R, carriers):
     """Enclose every colliding geom of the carrier bodies in capsules.
 
     Capsules and spheres are taken as they are. Capsules are fitted to the hull of any
-    other geom, see `enclose`.
+    other geom, see `enclose`. Where no geom of a moving link collides, all geoms count,
+    with a warning.
 
     Returns:
         The capsules, and the body name of each.
     """
     starts, ends, radii, segments, geoms, bodies = [], [], [], [], [], []
-    for geom in range(model.ngeom):
+    collide = (model.geom_contype | model.geom_conaffinity) != 0
+    if not np.any(collide & (segment[model.geom_bodyid] >= 0)):
+        warn(
+            "no geom of a moving link collides (contype and conaffinity are 0): all "
+            "geoms become capsules"
+        )
+        collide[:] = True
+    for geom in map(int, np.flatnonzero(collide)):
         body = int(model.geom_bodyid[geom])
-        collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
-        if body not in carriers or not collides:
+        if body not in carriers:
             continue
         k = int(segment[body])
         for start, end, radius in _capsules_of(model, data, geom):

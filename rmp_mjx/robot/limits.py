@@ -1,6 +1,10 @@
-"""Limits that MJCF has no attribute for: custom numbers of the file."""
+"""Limits that MJCF has no attribute for: custom numbers, and URDF's velocities."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -28,7 +32,31 @@ def rated(
     """
     if given is not None:
         return positive(name, given, n)
-    names = [model.numeric(k).name for k in range(model.nnumeric)]
-    if name not in names:
+    numbers = recorded(model)
+    if name not in numbers:
         return None
-    return positive(f"numeric '{name}'", np.array(model.numeric(name).data), n)
+    return positive(f"numeric '{name}'", numbers[name], n)
+
+
+def recorded(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """All custom numbers of a file by name."""
+    found = [model.numeric(k) for k in range(model.nnumeric)]
+    return {numeric.name: np.array(numeric.data) for numeric in found}
+
+
+def urdf_velocities(path: object, joints: Sequence[str]) -> list[float] | None:
+    """Velocity limits of a URDF file, which MuJoCo does not keep; None if it has none.
+
+    Args:
+        path: The model; anything but the path of a `.urdf` has none.
+        joints: Names of the joints, (n,).
+    """
+    if not (isinstance(path, (str, Path)) and str(path).endswith(".urdf")):
+        return None
+    found = {
+        str(joint.get("name")): float(limit.get("velocity", "nan"))
+        for joint in ElementTree.parse(path).iter("joint")
+        if (limit := joint.find("limit")) is not None
+    }
+    limits = [found.get(name, np.nan) for name in joints]
+    return limits if np.all(np.isfinite(limits)) and min(limits) > 0 else None

@@ -92,9 +92,11 @@ def lock_other_joints(
             raise RobotError(f"joint '{joint.name}' is {kind}: use hinges and slides")
     names = [joint.name for joint in chain]
     if not names:
+        moving = [body.name for body in spec.bodies if body.joints]
         raise RobotError(
             f"no joint between the world and site '{site}', which is on body "
-            f"'{spec.site(site).parent.name}': choose a site or body that moves"
+            f"'{spec.site(site).parent.name}': choose a site or body that moves; "
+            f"bodies with joints: {', '.join(moving) or 'none'}"
         )
     if joints is not None:
         for name in joints:
@@ -110,6 +112,7 @@ def lock_other_joints(
     for actuator in list(spec.actuators):
         if not any(drives(actuator, name) for name in names):
             spec.delete(actuator)
+    _warn_of_couplings(spec, names)
     # Grippers have these, and they may name a joint that goes.
     for part in (*spec.sensors, *spec.equalities, *spec.tendons, *spec.keys):
         spec.delete(part)
@@ -117,6 +120,18 @@ def lock_other_joints(
         if joint.name not in names:
             spec.delete(joint)
     return names
+
+
+def _warn_of_couplings(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
+    """Warn of mimic joints on the chain, which are free in the arm."""
+    kind = mujoco.mjtEq.mjEQ_JOINT
+    for equality in spec.equalities:
+        mimic = {equality.name1, equality.name2} & set(joints)
+        if equality.type == kind and mimic:
+            warn(
+                f"an equality couples joint {sorted(mimic)}: it is left out, so that "
+                "every joint of the chain moves by itself"
+            )
 
 
 def remove_gravity_compensation(spec: mujoco.MjSpec) -> None:

@@ -21,10 +21,10 @@ from rmp_mjx.robot.control_points import (
     sample_control_points,
 )
 from rmp_mjx.robot.end_effector import end_effector
-from rmp_mjx.robot.errors import Numbers, RobotError, vector
+from rmp_mjx.robot.errors import Numbers, RobotError, vector, warn
 from rmp_mjx.robot.fingerprint import fingerprint
 from rmp_mjx.robot.library import find
-from rmp_mjx.robot.limits import rated
+from rmp_mjx.robot.limits import rated, urdf_velocities
 from rmp_mjx.robot.links import carriers, frame_with_z, lumped_inertias, segments
 from rmp_mjx.robot.mjcf import (
     compile_spec,
@@ -36,7 +36,7 @@ from rmp_mjx.robot.mjcf import (
     remove_gravity_compensation,
 )
 from rmp_mjx.robot.motors import PassiveForces, make_motors, passive_forces
-from rmp_mjx.robot.posture import nominal_posture
+from rmp_mjx.robot.posture import nominal_posture, search_posture
 from rmp_mjx.types import Constant
 
 ARMATURE = {
@@ -228,12 +228,12 @@ class Robot(Pytree):
             armature: Rotor inertias that replace the file's, (n,) [kg m^2].
             torque_limits: Actuator limits that replace the file's, (n,) [N m or N].
             velocity_limits: Limits of the joint speeds, (n,) [rad/s or m/s]; default
-                the file's custom numbers of this name, else none.
+                a URDF's own, the custom numbers of this name in an MJCF, else none.
             torque_rate_limits: Limits of the torques' rates, (n,) [N m/s or N/s];
                 likewise.
             q_home: Nominal posture, (n,) [rad or m]; default keyframe `home`, else the
-                reference pose, with joints at mid-range where that is outside or close
-                to the end of their range.
+                reference pose, or a searched one where that is near the end of a
+                joint's range, singular, or in collision with itself.
             compensate_passive: Whether the controllers make up for the file's joint
                 damping and springs.
             spacing: Distance between control points along a link's capsules [m].
@@ -273,6 +273,9 @@ class Robot(Pytree):
         lower = np.where(limited, model.jnt_range[ids, 0], -np.inf)
         upper = np.where(limited, model.jnt_range[ids, 1], np.inf)
         q_ref = model.qpos0[model.jnt_qposadr[ids]].copy()
+        if velocity_limits is None:
+            velocity_limits = urdf_velocities(path, joints)
+        posture = nominal_posture(joints, lower, upper, home, q_home)
         passive = passive_forces(model, joints)
         if not compensate_passive:
             passive = PassiveForces()
@@ -284,7 +287,7 @@ class Robot(Pytree):
             offset=np.einsum("nji,nj->ni", prev_R, frames_p - prev_p),
             rotation=np.einsum("nji,njk->nik", prev_R, frames_R),
             q_ref=q_ref,
-            q_home=nominal_posture(joints, lower, upper, q_ref, home, q_home),
+            q_home=q_ref if posture is None else posture,
             q_lower=lower,
             q_upper=upper,
             tau_max=model.actuator_ctrlrange[:, 1].copy(),
@@ -314,4 +317,19 @@ class Robot(Pytree):
             assets=assets,
             **passive._asdict(),
         )
-        return robot.replace(capsules=capsules.replace(pairs=touching_pairs(robot)))
+        robot = robot.replace(capsules=capsules.replace(pairs=touching_pairs(robot)))
+        if posture is None:
+            robot = robot.replace(q_home=_searched(robot))
+        return robot
+
+
+def _searched(robot: Robot) -> np.ndarray:
+    """The posture of an arm whose file has none; warns if it had to be chosen."""
+    posture, fault = search_posture(robot)
+    if fault:
+        shown = ", ".join(f"{x:.2f}" for x in posture)
+        warn(
+            f"there is no keyframe 'home', and the reference pose {fault}: q_home is "
+            f"[{shown}], which was searched. Pass q_home= to choose a posture"
+        )
+    return posture

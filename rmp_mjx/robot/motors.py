@@ -115,7 +115,15 @@ def _kind(model: mujoco.MjModel, a: int) -> str:
 def _limit(
     model: mujoco.MjModel, joint: str, group: Sequence[mujoco.MjsActuator]
 ) -> float:
-    """Largest torque, either way, that the joint's one actuator can give."""
+    """Largest torque, either way, that the joint's one actuator can give.
+
+    A joint without one may have a limit itself: so a URDF gives it.
+    """
+    joint_id = model.joint(joint).id
+    if not group and model.jnt_actfrclimited[joint_id]:
+        limit = float(min(abs(model.jnt_actfrcrange[joint_id])))
+        if limit > 0:
+            return limit
     if len(group) != 1:
         names = f" ({', '.join(repr(a.name) for a in group)})" if group else ""
         raise RobotError(
@@ -127,7 +135,6 @@ def _limit(
     ranges = []
     if model.actuator_forcelimited[a]:
         ranges.append(gear * model.actuator_forcerange[a])
-    joint_id = model.joint(joint).id
     if model.jnt_actfrclimited[joint_id]:
         ranges.append(model.jnt_actfrcrange[joint_id])
     if kind == "motor" and model.actuator_ctrllimited[a]:

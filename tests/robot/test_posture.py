@@ -3,10 +3,13 @@
 import re
 import warnings
 
+import mujoco
 import numpy as np
 import pytest
 
 from rmp_mjx import Robot, RobotError, RobotWarning
+from rmp_mjx.robot.configurations import capsule_gaps
+from rmp_mjx.robot.posture import manipulability
 
 
 def text(second="-2 2", key="", first=""):
@@ -56,14 +59,40 @@ def test_a_bad_posture_is_refused(q_home, message):
 
 
 @pytest.mark.parametrize(
-    ("span", "middle"),
-    [("-3 -0.1", -1.55), ("0.5 1", 0.75), ("-0.1 4", 1.95), ("-4 0.1", -1.95)],
+    "span",
+    ["-3 -0.1", "0.5 1", "-0.1 4", "-4 0.1"],
     ids=["above", "below", "near the lower end", "near the upper end"],
 )
-def test_without_a_keyframe_a_joint_at_its_end_rests_at_mid_range(span, middle):
-    with pytest.warns(RobotWarning, match=r"'b' \(0, range .* Pass q_home="):
+def test_without_a_keyframe_a_joint_at_its_end_rests_well_within_its_range(span):
+    with pytest.warns(RobotWarning, match=r"near the end .* searched\. Pass q_home="):
         robot = load(text(span))
-    np.testing.assert_allclose(robot.q_home, [0.0, middle])
+    low, high = map(float, span.split())
+    share = (robot.q_home[1] - low) / (high - low)
+    assert 0.2 < share < 0.8
+
+
+def test_a_stretched_arm_rests_in_a_better_posture():
+    """The UR5e at zero is stretched out: its Jacobian has no inverse there."""
+    ur5e = Robot.load("ur5e")
+    with pytest.warns(RobotWarning, match="the reference pose is singular"):
+        robot = Robot.from_mjcf(ur5e.mjcf, site="ee")
+    both = np.stack([robot.q_ref, robot.q_home])
+    stretched, better = manipulability(robot, both)
+    assert stretched < 1e-6 and better > 0.05
+    assert better == pytest.approx(_by_mujoco(robot), rel=1e-6)
+    assert capsule_gaps(robot, both[1:], robot.capsules.pairs).min() > 0.05
+
+
+def _by_mujoco(robot):
+    """The square root of the determinant of J J^T at home."""
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.q_home
+    mujoco.mj_forward(model, data)
+    J = np.zeros((2, 3, robot.n))
+    mujoco.mj_jacSite(model, data, J[0], J[1], model.site(robot.site_name).id)
+    J = J.reshape(6, -1)
+    return np.sqrt(np.linalg.det(J @ J.T))
 
 
 def test_a_reference_pose_well_within_the_ranges_is_the_posture():
