@@ -25,6 +25,7 @@ from rmp_mjx.check_robot.reaches import (
     Draws,
     Track,
     draw_reaches,
+    greatest,
     reach_of,
     run_reaches,
 )
@@ -145,7 +146,7 @@ def _motion(robot: Robot, draws: Draws, track: Track) -> Table:
         ("acceleration", track.acceleration, limits.get("acceleration_limits")),
         ("torque rate", track.rate, robot.tau_rate_max),
     ):
-        most = seen.max(axis=0)
+        most = greatest(seen)
         text = f"{most.max():.1f}, no limit known"
         if limit is not None:
             text = f"{np.max(most / limit):.2f} of the limit"

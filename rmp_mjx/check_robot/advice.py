@@ -14,6 +14,7 @@ from rmp_mjx.check_robot.reaches import (
     PERIOD,
     Draws,
     Track,
+    greatest,
     reach_of,
 )
 from rmp_mjx.control import Leaves
@@ -103,16 +104,16 @@ def about_motion(robot: Robot, draws: Draws, track: Track) -> Iterator[str]:
     for j in np.flatnonzero(track.room.min(axis=0) < FROM_END):
         yield f"joint {robot.joint_names[j]} came within {FROM_END} of its range's end"
     if robot.qd_max is None:
-        speeds = ", ".join(f"{v:.1f}" for v in track.speed.max(axis=0))
+        speeds = ", ".join(f"{v:.1f}" for v in greatest(track.speed))
         yield (
             f"no velocity limits are known, and the joints ran at up to {speeds}: give "
             "velocity_limits= from the data sheet"
         )
-    elif np.any(track.speed.max(axis=0) > 1.1 * robot.qd_max):
+    elif np.any(greatest(track.speed) > 1.1 * robot.qd_max):
         yield "a joint ran at more than 1.1 of its velocity limit"
     limit = recorded(robot.mj_model).get("acceleration_limits")
-    if limit is not None and np.any(track.acceleration.max(axis=0) > 1.1 * limit):
-        most = np.max(track.acceleration.max(axis=0) / limit)
+    if limit is not None and np.any(greatest(track.acceleration) > 1.1 * limit):
+        most = np.max(greatest(track.acceleration) / limit)
         yield (
             f"joints accelerate with up to {most:.1f} times the file's limit, which no "
             "controller keeps: lower torque_rate_limits= and stiffness help"

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rmp_mjx import sim
 from rmp_mjx.control import RMPVICES
@@ -82,6 +82,12 @@ class Track(Pytree):
     """Rates of the torques [N m/s or N/s]."""
     limited: Float[Array, ""]
     """Number of steps in which a motor was at its limit."""
+
+
+def greatest(values: ArrayLike) -> np.ndarray:
+    """The greatest of each joint over the reaches that did not blow up, (n,)."""
+    seen = np.asarray(values)
+    return np.max(np.where(np.isfinite(seen), seen, 0.0), axis=0)
 
 
 def reach_of(robot: Robot) -> float:
