@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 
 def psd_solve(
@@ -20,7 +20,9 @@ def psd_solve(
     $A_{ij} / \sqrt{A_{ii} A_{jj}}$. It calls no LAPACK, so a batch of solves
     vectorises under `jax.vmap`. The scaling makes the accuracy independent of the
     units of the rows. Pivots are clamped at ``n`` machine epsilons (of the scaled
-    matrix, whose diagonal is one): a singular matrix gives a finite answer, not NaN.
+    matrix, whose diagonal is one). Where the clamped pivots of a singular matrix
+    multiply up beyond the range of the numbers, the answer is zero. So a finite ``b``
+    gets a finite answer, not NaN.
     In float32 the relative error is about 1e-7 times the condition of the scaled
     matrix, so metrics of one tree should be capped to span less than about 1e6.
 
@@ -62,7 +64,9 @@ def psd_solve(
     for i in reversed(range(n)):
         for k in range(i + 1, n):
             x[i] = x[i] - ell[k][i] * x[k]
-    return jnp.stack([x[i] * scale[i] for i in range(n)])
+    x = jnp.stack([x[i] * scale[i] for i in range(n)])
+    finite = jnp.all(jnp.isfinite(x), axis=0, keepdims=True)
+    return jnp.where(finite, x, 0.0 * b)
 
 
 def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -103,6 +107,32 @@ def solve_lower(
             x[i] = x[i] - (L[k, i] if transposed else L[i, k]) * x[k]
         x[i] = x[i] / L[i, i]
     return jnp.stack(x)
+
+
+LARGEST = 1e4
+"""Largest number that counts as an input of a controller, in SI units."""
+
+LOOSE = 0.05
+"""Error of an orthonormal vector or matrix that may be rounding, in any precision."""
+
+
+def bounded(x: Float[ArrayLike, ...], low: float = -LARGEST) -> Bool[Array, ""]:
+    """Whether all numbers are finite, at least ``low`` and at most `LARGEST`."""
+    return jnp.all((jnp.asarray(x) >= low) & (jnp.asarray(x) <= LARGEST))
+
+
+def is_unit(x: Float[ArrayLike, "*b n"]) -> Bool[Array, "*b"]:
+    """Whether vectors have length one, up to `LOOSE`."""
+    x = jnp.asarray(x)
+    return jnp.abs(jnp.sum(x * x, axis=-1) - 1.0) <= LOOSE
+
+
+def is_rotation(R: Float[ArrayLike, "*b 3 3"]) -> Bool[Array, "*b"]:
+    """Whether matrices are rotations, up to `LOOSE`: z = x cross y, of unit vectors."""
+    x, y, z = (jnp.asarray(R)[..., i] for i in range(3))
+    right_handed = jnp.all(jnp.abs(jnp.cross(x, y) - z) <= LOOSE, axis=-1)
+    square = jnp.abs(jnp.sum(x * y, axis=-1)) <= LOOSE
+    return right_handed & square & is_unit(x) & is_unit(y)
 
 
 def safe_norm(x: Float[Array, "*b n"], eps: float = 1e-12) -> Float[Array, "*b"]:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from rmp_mjx.pytree import Constant, Pytree
+from rmp_mjx.refuse import (
+    directions,
+    not_negative,
+    positive,
+    refuse_unless,
+)
+from rmp_mjx.refuse import rotations as are_rotations
 from rmp_mjx.shapes import KINDS, TINY, Boxes, Capsules, Gap, Planes, Shape, Spheres
 from rmp_mjx.vec import Vec
 
@@ -84,6 +92,28 @@ class Obstacles(Pytree):
         every = (self.spheres, self.planes, self.capsules, self.boxes)
         return tuple(kind for kind in every if kind.active.shape[-1])
 
+    def cleared(self) -> tuple[Obstacles, Bool[Array, ""]]:
+        """The obstacles without what nobody can use, and whether all can be used.
+
+        A slot that is not in use, or whose numbers mean no obstacle, gets the content
+        that it has in `empty`. So nothing is computed with what was there.
+
+        Returns:
+            The obstacles, and False if a slot in use means no obstacle (`Shape.sound`).
+        """
+        kinds = ("spheres", "planes", "capsules", "boxes")
+        given = {kind: getattr(self, kind) for kind in kinds}
+        empty = Obstacles.empty(*(x.active.shape[0] for x in given.values()))
+        kept, good = {}, [jnp.array(True)]
+        for kind, slots in given.items():
+            sound = slots.sound()
+            use = sound & slots.active
+            kept[kind] = jax.tree.map(
+                functools.partial(_where, use), slots, getattr(empty, kind)
+            )
+            good.append(jnp.all(sound | ~jnp.asarray(slots.active)))
+        return Obstacles(**kept), jnp.all(jnp.stack(good))
+
     def gaps(
         self, x: Vec, v: Vec, rho: Float[Constant, " p"], hand: Bool[np.ndarray, " p"]
     ) -> dict[str, Gap]:
@@ -116,9 +146,10 @@ class Obstacles(Pytree):
             hand_may_touch: (k,) or one bool; all other links still avoid them.
 
         Raises:
-            ValueError: More than the slots there are, or a radius that is not positive.
+            ValueError: More than the slots there are, or numbers that mean no sphere.
         """
-        _check_positive("sphere radii", radii)
+        _check_vectors(centers=centers, velocities=velocities)
+        refuse_unless(positive, "sphere radii", radii, "positive and finite")
         spheres = _fill(
             self.spheres,
             center=centers,
@@ -145,8 +176,10 @@ class Obstacles(Pytree):
             hand_may_touch: (k,) or one bool; all other links still avoid them.
 
         Raises:
-            ValueError: More than the slots there are.
+            ValueError: More than the slots there are, or numbers that mean no plane.
         """
+        _check_vectors(points=points, normals=normals, velocities=velocities)
+        refuse_unless(directions, "plane normals", normals, "of some length")
         normals = jnp.asarray(normals, float)
         planes = _fill(
             self.planes,
@@ -178,9 +211,15 @@ class Obstacles(Pytree):
             hand_may_touch: (k,) or one bool; all other links still avoid them.
 
         Raises:
-            ValueError: More than the slots there are, or a radius that is not positive.
+            ValueError: More than the slots there are, or numbers that mean no capsule.
         """
-        _check_positive("capsule radii", radii)
+        _check_vectors(
+            starts=starts,
+            ends=ends,
+            velocities=velocities,
+            angular_velocities=angular_velocities,
+        )
+        refuse_unless(positive, "capsule radii", radii, "positive and finite")
         starts, ends = jnp.asarray(starts, float), jnp.asarray(ends, float)
         length = jnp.linalg.norm(ends - starts, axis=-1)
         axis = (ends - starts) / jnp.maximum(length, TINY)[..., None]
@@ -220,9 +259,17 @@ class Obstacles(Pytree):
             hand_may_touch: (k,) or one bool; all other links still avoid them.
 
         Raises:
-            ValueError: More than the slots there are, or a half size not positive.
+            ValueError: More than the slots there are, or numbers that mean no box.
         """
-        _check_positive("box half sizes", half_sizes)
+        _check_vectors(
+            centers=centers,
+            half_sizes=half_sizes,
+            velocities=velocities,
+            angular_velocities=angular_velocities,
+        )
+        refuse_unless(positive, "box half sizes", half_sizes, "positive and finite")
+        refuse_unless(not_negative, "box radii", radii, "finite and not negative")
+        refuse_unless(are_rotations, "box rotations", rotations, "rotation matrices")
         if rotations is None:
             rotations = jnp.tile(jnp.eye(3), (np.shape(centers)[0], 1, 1))
         boxes = _fill(
@@ -238,13 +285,21 @@ class Obstacles(Pytree):
         return self.replace(boxes=boxes)
 
 
-def _check_positive(what: str, values: Numbers) -> None:
-    """Refuse concrete values that are not positive and finite; tracers pass."""
-    if isinstance(values, Tracer):
-        return
-    array = np.asarray(values, float)
-    if not (np.all(np.isfinite(array)) and np.all(array > 0)):
-        raise ValueError(f"{what} must be positive and finite, got {array.tolist()}")
+def _where(use: Array, x: ArrayLike, home: Array) -> Array:
+    """The slots' own content where they are used, else that of an empty slot."""
+    x = jnp.asarray(x)
+    use = use.reshape(-1, *(1,) * (x.ndim - 1))
+    return jnp.where(use, x, home.astype(x.dtype))
+
+
+def _check_vectors(**given: Numbers | None) -> None:
+    """Refuse what are not vectors (k, 3), and known ones that are not finite."""
+    for name, values in given.items():
+        if values is not None and np.shape(values)[1:] != (3,):
+            raise ValueError(
+                f"{name} must be vectors (k, 3), got shape {np.shape(values)}"
+            )
+        refuse_unless(np.isfinite, name, values, "finite")
 
 
 def _fill(slots: Kind, **contents: Numbers | None) -> Kind:

@@ -16,6 +16,8 @@ centripetal terms of a rotating obstacle. The gradient is a unit normal everywhe
 from __future__ import annotations
 
 import abc
+import functools
+import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -23,6 +25,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from rmp_mjx.math import LARGEST, is_rotation, is_unit
 from rmp_mjx.pytree import Constant, Pytree
 from rmp_mjx.vec import Vec, xyz
 
@@ -64,6 +67,13 @@ class Shape(Pytree, abc.ABC):
         Positions x and velocities v are (1, p) each.
         """
 
+    def sound(self) -> Bool[Array, " o"]:
+        """Which slots hold numbers that mean an obstacle, (o,), in use or not."""
+        fields = [jnp.asarray(x) for x in vars(self).values()]
+        sizes = [jnp.abs(x) for x in fields if x.dtype != bool]
+        small = [jnp.all(x <= LARGEST, axis=range(1, x.ndim)) for x in sizes]
+        return functools.reduce(operator.and_, small)
+
     def greatest_speed(self) -> Float[Array, " o"]:
         """Greatest speed of any point of each obstacle's core, (o,) [m/s]."""
         return _norm(self.velocity)
@@ -84,6 +94,10 @@ class Turning(Shape):
     angular_velocity: Float[Constant, "o 3"]
     """Angular velocity, world frame [rad/s]."""
 
+    def sound(self) -> Bool[Array, " o"]:
+        """Which slots hold numbers that mean an obstacle, (o,)."""
+        return super().sound() & (self.radius >= 0.0)
+
     def _ride_along(self, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
         """Position, velocity and Coriolis acceleration in the moving frame."""
         omega = Vec.column(self.angular_velocity)
@@ -102,6 +116,10 @@ class Spheres(Shape):
     radius: Float[Constant, " o"]
     """Radius [m]."""
 
+    def sound(self) -> Bool[Array, " o"]:
+        """Which slots hold numbers that mean an obstacle, (o,)."""
+        return super().sound() & (self.radius >= 0.0)
+
     def gap(
         self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
     ) -> Gap:
@@ -118,6 +136,10 @@ class Planes(Shape):
     """A point on the surface, world frame [m]."""
     normal: Float[Constant, "o 3"]
     """Unit normal that points out of the obstacle."""
+
+    def sound(self) -> Bool[Array, " o"]:
+        """Which slots hold numbers that mean an obstacle, (o,)."""
+        return super().sound() & is_unit(self.normal)
 
     def gap(
         self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]
@@ -136,6 +158,10 @@ class Capsules(Turning):
     """Unit vector along the segment."""
     half_length: Float[Constant, " o"]
     """Half the segment's length [m]."""
+
+    def sound(self) -> Bool[Array, " o"]:
+        """Which slots hold numbers that mean an obstacle, (o,)."""
+        return super().sound() & (self.half_length >= 0.0) & is_unit(self.axis)
 
     def greatest_speed(self) -> Float[Array, " o"]:
         """Greatest speed of any point of each segment, (o,) [m/s]."""
@@ -162,6 +188,11 @@ class Boxes(Turning):
     """Orientation (columns are the box's axes)."""
     half_size: Float[Constant, "o 3"]
     """Half sizes of the core [m]."""
+
+    def sound(self) -> Bool[Array, " o"]:
+        """Which slots hold numbers that mean an obstacle, (o,)."""
+        size = jnp.all(jnp.asarray(self.half_size) >= 0.0, axis=-1)
+        return super().sound() & size & is_rotation(self.rotation)
 
     def greatest_speed(self) -> Float[Array, " o"]:
         """Greatest speed of any point of each core, (o,) [m/s]."""

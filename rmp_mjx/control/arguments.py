@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.types import Action, Setpoint
+from rmp_mjx.types import Action, LeafWeights, Setpoint
 
 _KINDS = {"float": jnp.floating, "bool": np.bool_}
 
@@ -75,6 +75,7 @@ def check_action(action: Any) -> None:
         )
     for name in ("dpos", "drot", "kp_pos", "kp_ori"):
         check(f"action.{name}", getattr(action, name), (3,))
+    _check_numbers("action.weights", action.weights)
 
 
 def check_setpoint(setpoint: Any) -> None:
@@ -91,8 +92,24 @@ def check_setpoint(setpoint: Any) -> None:
     shapes = {"p_des": (3,), "R_des": (3, 3), "kp_pos": (3,), "kp_ori": (3,)}
     for name, shape in shapes.items():
         check(f"setpoint.{name}", getattr(setpoint, name), shape)
-    if np.shape(setpoint.time) != ():
-        check("setpoint.time", setpoint.time, ())
+    check_number("setpoint.time", setpoint.time)
+    _check_numbers("setpoint.weights", setpoint.weights)
+
+
+def check_number(name: str, value: Any) -> None:
+    """Refuse what is not one number, of any type.
+
+    Raises:
+        ValueError: See `check`.
+    """
+    if np.shape(value) != ():
+        check(name, value, ())
+
+
+def _check_numbers(name: str, weights: LeafWeights | None) -> None:
+    """Refuse weights that are not one number each; None are none."""
+    for field, value in {} if weights is None else vars(weights).items():
+        check_number(f"{name}.{field}", value)
 
 
 def check_obstacles(obstacles: Any) -> None:

@@ -38,7 +38,16 @@ from rmp_mjx.xla import materialize
 def per_link(
     robot: Robot, values: Float[ArrayLike, " n"] | Sequence[float]
 ) -> Float[Array, " p"]:
-    """A leaf parameter for every control point from one for every link, (n,)."""
+    """A leaf parameter for every control point from one for every link, (n,).
+
+    Raises:
+        ValueError: There are not as many values as links.
+    """
+    if np.shape(values) != (robot.n,):
+        raise ValueError(
+            f"per_link needs a value for each of the {robot.n} links, "
+            f"got shape {np.shape(values)}"
+        )
     return jnp.asarray(values)[np.array(robot.points.segment, int)]
 
 

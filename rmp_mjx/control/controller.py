@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from typing import Any, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Float, Real
@@ -13,10 +14,12 @@ from rmp_mjx.control.action import ActionRange, compose_setpoint
 from rmp_mjx.control.arguments import (
     check,
     check_action,
+    check_number,
     check_obstacles,
     check_setpoint,
     check_state,
 )
+from rmp_mjx.control.fail_safe import Inputs, answered, judged
 from rmp_mjx.control.guard import StopGuard
 from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
@@ -109,6 +112,7 @@ class ImpedanceController(Pytree, abc.ABC):
         """
         check("q", q, (self.robot.n,))
         check_action(action)
+        check_number("time", time)
         p, R = site_pose(self.robot, jnp.asarray(q))
         return compose_setpoint(p, R, action, time)
 
@@ -142,12 +146,14 @@ class ImpedanceController(Pytree, abc.ABC):
         check_state(self.robot.n, q, qd, tau_ext, tau_last)
         check_setpoint(setpoint)
         check_obstacles(obstacles)
-        arm = arm_state(self.robot, jnp.asarray(q), jnp.asarray(qd))
-        ext, last = (
-            None if tau is None else jnp.asarray(tau) for tau in (tau_ext, tau_last)
-        )
-        out = self.unguarded(arm, setpoint, obstacles, ext, last)
-        return self._guarded(out, arm, obstacles, ext)
+        joints = jax.tree.map(jnp.asarray, (q, qd, tau_ext, tau_last))
+        q, qd, tau_ext, tau_last = joints
+        given = Inputs(q, qd, setpoint, obstacles, tau_ext, tau_last)
+        safe, verdict = judged(given)
+        arm = arm_state(self.robot, safe.q, safe.qd)
+        out = self.unguarded(arm, *safe[2:])
+        out = self._guarded(out, arm, safe.obstacles, safe.tau_ext)
+        return answered(self.robot, arm, out, verdict)
 
     @abc.abstractmethod
     def unguarded(

@@ -21,6 +21,7 @@ from rmp_mjx.control.root import Rows, solve_root
 from rmp_mjx.control.torque import clip_torque, speed_range, stop_time, torque_range
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
+from rmp_mjx.refuse import not_negative, refuse_unless
 from rmp_mjx.rmp import RMP, Leaf, Node, Siblings, evaluate, pullback
 from rmp_mjx.rmp.leaves.attractor import PositionAttractor, orientation_attractor
 from rmp_mjx.robot.dynamics import dynamics
@@ -77,7 +78,13 @@ class RMPVICES(ImpedanceController):
     """Branches of your own on the joints, beside those of the library."""
 
     def __post_init__(self):
-        """Fill in the default leaves, which depend on the robot."""
+        """Fill in the default leaves, which depend on the robot.
+
+        Raises:
+            ValueError: The regulariser is negative or not finite.
+        """
+        wanted = "finite and not negative"
+        refuse_unless(not_negative, "regularizer", self.regularizer, wanted)
         if self.leaves is None:
             object.__setattr__(self, "leaves", Leaves.default(self.robot))
 

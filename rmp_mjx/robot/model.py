@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from rmp_mjx.names import unknown
 from rmp_mjx.pytree import Pytree
+from rmp_mjx.refuse import refuse_crossed
 from rmp_mjx.robot.configurations import touching_pairs
 from rmp_mjx.robot.control_points import (
     Capsules,
@@ -115,6 +116,14 @@ class Robot(Pytree):
     [N m/rad or N/m]."""
     spring_ref: Float[Constant, " n"] | None = None
     """Joint coordinates at which those springs are slack [rad or m]."""
+
+    def __post_init__(self):
+        """Check the joint limits.
+
+        Raises:
+            ValueError: A lower limit is above the upper one.
+        """
+        refuse_crossed(self.q_lower, self.q_upper, ("q_lower", "q_upper"))
 
     def __repr__(self) -> str:
         """Name, joints, end effector and control points on one line."""

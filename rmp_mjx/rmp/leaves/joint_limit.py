@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from rmp_mjx.math import speed_gate
 from rmp_mjx.pytree import Constant
+from rmp_mjx.refuse import refuse_crossed
 from rmp_mjx.rmp.leaf import Param, ScalarLeaf
 from rmp_mjx.rmp.leaves.barrier import Barrier
 
@@ -30,6 +31,14 @@ class JointLimitBarrier(ScalarLeaf):
     """Upper limits, (n,), [rad] or [m]; +inf for none."""
     barrier: Barrier = flax.struct.field(default_factory=joint_limit_barrier)
     """The barrier applied to each side; its fields may be scalars or (n,)."""
+
+    def __post_init__(self):
+        """Check the limits.
+
+        Raises:
+            ValueError: A lower limit is above the upper one.
+        """
+        refuse_crossed(self.lower, self.upper, ("lower", "upper"))
 
     def braking(self, stop_time: Float[Array, ""] | float) -> JointLimitBarrier:
         """The barriers for an arm that needs this time to stop [s]."""
