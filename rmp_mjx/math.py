@@ -21,8 +21,8 @@ def psd_solve(
     vectorises under `jax.vmap`. The scaling makes the accuracy independent of the
     units of the rows. Pivots are clamped at ``n`` machine epsilons (of the scaled
     matrix, whose diagonal is one). Where the clamped pivots of a singular matrix
-    multiply up beyond the range of the numbers, the answer is zero. So a finite ``b``
-    gets a finite answer, not NaN.
+    multiply up, beyond the square root of the largest number, the answer is zero. So a
+    finite ``b`` gets a finite answer, not NaN.
     In float32 the relative error is about 1e-7 times the condition of the scaled
     matrix, so metrics of one tree should be capped to span less than about 1e6.
 
@@ -65,8 +65,9 @@ def psd_solve(
         for k in range(i + 1, n):
             x[i] = x[i] - ell[k][i] * x[k]
     x = jnp.stack([x[i] * scale[i] for i in range(n)])
-    finite = jnp.all(jnp.isfinite(x), axis=0, keepdims=True)
-    return jnp.where(finite, x, 0.0 * b)
+    most = jnp.finfo(A.dtype).max ** 0.5
+    solved = jnp.all(jnp.abs(x) <= most, axis=0, keepdims=True)  # False for NaN
+    return jnp.where(solved, x, 0.0 * b)
 
 
 def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
