@@ -271,7 +271,7 @@ class Obstacles(Pytree):
         refuse_unless(not_negative, "box radii", radii, "finite and not negative")
         refuse_unless(are_rotations, "box rotations", rotations, "rotation matrices")
         if rotations is None:
-            rotations = jnp.tile(jnp.eye(3), (np.shape(centers)[0], 1, 1))
+            rotations = jnp.tile(jnp.eye(3), (jnp.asarray(centers).shape[0], 1, 1))
         boxes = _fill(
             self.boxes,
             center=centers,
@@ -295,10 +295,9 @@ def _where(use: Array, x: ArrayLike, home: Array) -> Array:
 def _check_vectors(**given: Numbers | None) -> None:
     """Refuse what are not vectors (k, 3), and known ones that are not finite."""
     for name, values in given.items():
-        if values is not None and np.shape(values)[1:] != (3,):
-            raise ValueError(
-                f"{name} must be vectors (k, 3), got shape {np.shape(values)}"
-            )
+        shape = None if values is None else jnp.asarray(values).shape
+        if shape is not None and shape[1:] != (3,):
+            raise ValueError(f"{name} must be vectors (k, 3), got shape {shape}")
         refuse_unless(np.isfinite, name, values, "finite")
 
 
@@ -306,7 +305,7 @@ def _fill(slots: Kind, **contents: Numbers | None) -> Kind:
     """Write k obstacles into the first k slots and switch the rest off."""
     total = slots.active.shape[0]
     first = next(value for value in contents.values() if value is not None)
-    k = np.shape(first)[0]
+    k = jnp.asarray(first).shape[0]
     if k > total:
         kind = KINDS[type(slots)]
         raise ValueError(

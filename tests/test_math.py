@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rmp_mjx import math as rmath
@@ -184,6 +186,57 @@ def test_psd_solve_matches_numpy_in_float64(batched_solve):
     error = np.linalg.norm(x - expected, axis=1) / np.linalg.norm(expected, axis=1)
     # 1e-9: condition 1e6 times float64 epsilon, with a factor of 7 twice.
     assert error.max() < 1e-9
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(
+    rank=st.integers(0, 6),
+    spread=st.integers(0, 4),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_psd_solve_gives_finite_numbers_whatever_the_rank(
+    wide_solve, rank, spread, seed
+):
+    """100,000 matrices of 7 unknowns, with rows and units up to 10^(+-spread).
+
+    And their products with the answer are finite, too.
+    """
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(2000, rank, 7)) * 10.0 ** rng.uniform(
+        -spread, spread, (2000, rank, 1)
+    )
+    rows *= 10.0 ** rng.uniform(-spread, spread, (2000, 1, 7))
+    A = np.einsum("bri,brj->bij", *[rows.astype(np.float32)] * 2)
+    x = np.asarray(wide_solve(A, rng.normal(size=(2000, 7)).astype(np.float32)))
+    assert np.isfinite(x).all()
+    assert np.isfinite(x * x).all()
+
+
+@pytest.fixture(scope="module")
+def wide_solve():
+    """The solver vmapped over 2,000 systems of 7 unknowns."""
+    return jax.jit(jax.vmap(rmath.psd_solve))
+
+
+def test_psd_solve_passes_on_what_is_no_number(batched_solve):
+    A = np.tile(np.eye(7, dtype=np.float32), (50, 1, 1))
+    assert np.isnan(batched_solve(A, np.full((50, 7), np.nan, np.float32))).all()
+
+
+def test_only_rotations_count_as_rotations(rotations):
+    R = Rotation.from_rotvec(rotations).as_matrix().astype(np.float32)
+    assert np.all(rmath.is_rotation(R))
+    assert not np.any(rmath.is_rotation(-R)) and not np.any(rmath.is_rotation(2 * R))
+    assert not np.any(rmath.is_rotation(np.nan * R))
+    assert not np.any(rmath.is_rotation(R[:, :, [0, 0, 1]]))
+
+
+def test_numbers_that_are_none_or_too_large_are_not_bounded():
+    assert rmath.bounded(jnp.array([-1e4, 1e4]))
+    for wrong in (np.nan, np.inf, -np.inf, 1.1e4):
+        assert not rmath.bounded(jnp.array([0.0, wrong]))
+    assert not rmath.bounded(jnp.array(-1e-3), low=0.0)
+    assert rmath.bounded(jnp.zeros(0))
 
 
 def test_psd_solve_error_in_float32_is_bounded_by_the_condition(batched_solve):

@@ -101,12 +101,14 @@ class Sampler:
     def _one(self, q, qd, policy, noise):
         """Inputs of one state; one slot of each kind is not in use."""
         action = rmp.WeightedActionRange().decode(policy)
-        x = (jnp.array([0.3, 0.0, 0.3]) + 0.4 * noise[:24].reshape(8, 3)).astype("f")
+        x = jnp.array([[0.3, 0.0, 0.3]]) + 0.4 * noise[:24].reshape(8, 3)
         v = noise[24:33].reshape(3, 3)
         obstacles = (
             rmp.Obstacles.empty(**SLOTS)
             .with_spheres(x[:2], 0.05, v[:2], hand_may_touch=jnp.array([False, True]))
-            .with_planes(jnp.array([[0.0, 0.0, -0.1]]), x[2:3] + jnp.array([0, 0, 2.0]))
+            .with_planes(
+                jnp.array([[0.0, 0.0, -0.1]]), x[2:3] + jnp.array([[0.0, 0.0, 2.0]])
+            )
             .with_capsules(x[3:4], x[4:5], 0.05, v[:1], v[1:2])
             .with_boxes(x[5:6], [[0.1, 0.2, 0.05]], None, 0.02, v[:1], v[2:])
         )

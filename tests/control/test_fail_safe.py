@@ -1,4 +1,4 @@
-"""Inputs that nobody can use: a flag, a bounded torque, and no other state disturbed."""
+"""Inputs that nobody can use: a flag, a bounded torque, no other state disturbed."""
 
 import re
 from typing import Any
@@ -10,10 +10,11 @@ import pytest
 
 from benchmarks.studies import faults
 from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, Setpoint, per_link
-from rmp_mjx.control.fail_safe import BRAKING_TIME
+from rmp_mjx.control.fail_safe import BRAKING_TIME, Inputs, judged
+from rmp_mjx.math import exp_so3
+from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
-from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from tests.control.conftest import QUICK, changed
 from tests.robot.test_model import GRIPPER
 
@@ -120,10 +121,16 @@ def test_a_filter_that_knows_an_obstacle_by_half_solves_nothing(sampler, run):
         assert not found["usable"].any() and not found["solved"].any()
 
 
-@pytest.mark.parametrize("name", ["rmp_vices", "vices"])
-def test_gradients_are_finite_in_hostile_states(robot, sampler, name):
-    """By joints and set-point: zero where the torque does not depend on them."""
-    ctrl = faults.controllers(robot)[name]
+@pytest.mark.parametrize(
+    "name", ["vices", pytest.param("rmp_vices", marks=pytest.mark.slow)]
+)
+def test_gradients_are_finite_in_hostile_states(name):
+    """By joints and set-point: zero where the torque does not depend on them.
+
+    With six joints or more: VICES inverts the whole operational inertia.
+    """
+    arm = faults.random_arm(0, joints=7)
+    ctrl, sampler = faults.controllers(arm)[name], faults.Sampler(arm)
 
     @jax.jit(compiler_options=QUICK)
     @jax.vmap
@@ -158,20 +165,17 @@ def test_an_arm_without_pairs_or_obstacles_works_in_every_controller():
 
 def test_half_precision_inputs_can_be_used():
     """Rotations and normals of float16 are off by 1e-3, of bfloat16 by 1e-2."""
-    arm = Robot.from_mjcf(GRIPPER, site="tip", spacing=0.1)
-    q = jnp.array([0.1, 0.5, -0.3])
     slots = Obstacles.empty(planes=1).with_planes([[0, 0, -1.0]], [[0.3, 0.5, 0.7]])
-    ctrl = VICES(arm)
-    setpoint = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
+    R, ones = exp_so3(jnp.array([0.4, -0.7, 1.1])), jnp.ones(3)
+    setpoint = Setpoint(ones, R, 300.0 * ones, 300.0 * ones, jnp.float32(0.0))
+    given = Inputs(ones, ones, setpoint, slots, None, None)
     for dtype in (jnp.float16, jnp.bfloat16):
 
         def half(x, dtype=dtype):
-            x = jnp.asarray(x)
             return x if x.dtype == bool else x.astype(dtype)
 
-        given = jax.tree.map(half, (q, q, setpoint, slots))
-        run = jax.jit(ctrl, compiler_options=QUICK)
-        assert run(*given).diagnostics["usable"] == 1.0
+        safe, verdict = judged(jax.tree.map(half, given))
+        assert verdict.all and safe.q.dtype == dtype
 
 
 NAN = float("nan")
@@ -249,7 +253,7 @@ def test_traced_numbers_pass_and_make_the_state_unusable(robot):
     def flag(x, eps):
         RMPVICES(robot, regularizer=eps)
         slots = SLOTS.with_spheres([[x, 0.0, 0.0]], 0.1).with_planes(UP, [[0, 0, x]])
-        return ctrl(q, q, setpoint, slots).diagnostics["usable"]
+        return judged(Inputs(q, q, setpoint, slots, None, None))[1].all
 
     assert [float(flag(x, -1.0)) for x in (1.0, 0.0, NAN, np.inf)] == [1, 0, 0, 0]
 
