@@ -72,4 +72,5 @@ class ControlOutput(Pytree):
     ``Mq qdd + bias = tau + tau_ext``."""
     diagnostics: dict[str, Any]
     """By name. Every controller has `torque_limit` (n,): -1 or 1 where a torque is at
-    its lower or upper limit, else 0. The controller documents the others."""
+    its lower or upper limit, else 0; and `usable`: 1 where its inputs could be used, 0
+    where the torque is a fall-back (docs/fail_safe.md). It documents the others."""

@@ -14,13 +14,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Room -> the rooms that it may import (besides itself). Single modules at the top of
 # the package are rooms of their own; `rmp_mjx` is the public facade.
-GROUND = {"math", "metric", "names", "pytree", "trees", "xla"}
+GROUND = {"math", "metric", "names", "pytree", "refuse", "trees", "xla"}
 BASE = GROUND | {"types", "vec"}
 LAW = {
     "math": set(),
     "metric": {"names"},
     "names": set(),
     "pytree": set(),
+    "refuse": set(),
     "trees": set(),
     "xla": set(),
     "files": set(),

@@ -138,7 +138,8 @@ class ImpedanceController(Pytree, abc.ABC):
                 matters where the robot has a limit of the torques' rate.
 
         Returns:
-            What `unguarded` gives, behind the guard if there is one.
+            What `unguarded` gives, behind the guard if there is one, and whether the
+            inputs are `usable`. If not, the torque is a fall-back: docs/fail_safe.md.
 
         Raises:
             ValueError: An argument has a wrong shape or dtype.

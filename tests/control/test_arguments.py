@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rmp_mjx import RMPVICES, VICES, Action, ActionRange, Obstacles, Robot
+from rmp_mjx import (
+    RMPVICES,
+    VICES,
+    Action,
+    ActionRange,
+    LeafWeights,
+    Obstacles,
+    Robot,
+)
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.controller import ImpedanceController
 from tests.control.conftest import changed
@@ -107,15 +115,18 @@ def test_right_arguments_pass_in_any_precision_and_batched_by_vmap(robot):
     assert out.tau.shape == (8, 3)
 
 
-def test_the_checks_leave_no_trace_in_the_program(robot):
-    """The same operations with and without obstacle slots of no use to VICES."""
-    ctrl = VICES(robot)
-    setpoint = ctrl.setpoint(Q, ACTION, 0.0)
-    empty, full = (
-        str(jax.make_jaxpr(lambda q, o=o: ctrl(q, q, setpoint, o).tau)(Q))
-        for o in (Obstacles.empty(), SLOTS)
+def test_the_weights_of_the_leaves_are_checked_too(robot):
+    ctrl: Any = VICES(robot)
+    weights = LeafWeights(np.zeros(2), 1.0, 0.0)
+    message = (
+        r"weights\.attractor must be a float array of shape \(\), got float64 \(2,\)"
     )
-    assert empty == full
+    with pytest.raises(ValueError, match="setpoint." + message):
+        call(ctrl, weights=weights)
+    with pytest.raises(ValueError, match="action." + message):
+        ctrl.setpoint(Q, changed(ACTION, weights=weights), 0.0)
+    with pytest.raises(ValueError, match=r"time must be .* got float64 \(4,\)"):
+        ctrl.setpoint(Q, ACTION, np.zeros(4))
 
 
 def test_an_action_and_a_set_point_are_not_confused(robot):
