@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -95,24 +93,18 @@ class Obstacles(Pytree):
     def cleared(self) -> tuple[Obstacles, Bool[Array, ""]]:
         """The obstacles without what nobody can use, and whether all can be used.
 
-        A slot that is not in use, or whose numbers mean no obstacle, gets the content
-        that it has in `empty`. So nothing is computed with what was there.
+        A slot that is not in use, or whose numbers mean no obstacle, gets zeros and is
+        not in use. So nothing is computed with what was there.
 
         Returns:
             The obstacles, and False if a slot in use means no obstacle (`Shape.sound`).
         """
-        kinds = ("spheres", "planes", "capsules", "boxes")
-        given = {kind: getattr(self, kind) for kind in kinds}
-        empty = Obstacles.empty(*(x.active.shape[0] for x in given.values()))
-        kept, good = {}, [jnp.array(True)]
-        for kind, slots in given.items():
+        kept, good = [], []
+        for slots in vars(self).values():
             sound = slots.sound()
-            use = sound & slots.active
-            kept[kind] = jax.tree.map(
-                functools.partial(_where, use), slots, getattr(empty, kind)
-            )
+            kept.append(slots.where(sound & slots.active))
             good.append(jnp.all(sound | ~jnp.asarray(slots.active)))
-        return Obstacles(**kept), jnp.all(jnp.stack(good))
+        return Obstacles(*kept), jnp.all(jnp.stack(good))
 
     def gaps(
         self, x: Vec, v: Vec, rho: Float[Constant, " p"], hand: Bool[np.ndarray, " p"]
@@ -261,13 +253,13 @@ class Obstacles(Pytree):
         Raises:
             ValueError: More than the slots there are, or numbers that mean no box.
         """
+        refuse_unless(positive, "box half sizes", half_sizes, "positive and finite")
         _check_vectors(
             centers=centers,
             half_sizes=half_sizes,
             velocities=velocities,
             angular_velocities=angular_velocities,
         )
-        refuse_unless(positive, "box half sizes", half_sizes, "positive and finite")
         refuse_unless(not_negative, "box radii", radii, "finite and not negative")
         refuse_unless(are_rotations, "box rotations", rotations, "rotation matrices")
         if rotations is None:
@@ -283,13 +275,6 @@ class Obstacles(Pytree):
             hand_may_touch=hand_may_touch,
         )
         return self.replace(boxes=boxes)
-
-
-def _where(use: Array, x: ArrayLike, home: Array) -> Array:
-    """The slots' own content where they are used, else that of an empty slot."""
-    x = jnp.asarray(x)
-    use = use.reshape(-1, *(1,) * (x.ndim - 1))
-    return jnp.where(use, x, home.astype(x.dtype))
 
 
 def _check_vectors(**given: Numbers | None) -> None:

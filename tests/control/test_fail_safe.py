@@ -56,9 +56,9 @@ def test_hostile_states_get_torques_within_the_limits_and_a_right_flag(
     rng = np.random.default_rng(1)
     for family, fault in faults.FAULTS.items():
         found = faults.attack(lambda x: run(name, x), sampler, fault, rng, BATCH)
-        assert found.wrong == 0, (family, found)
         everywhere = family in ("plausible", "at_the_bounds", "unused")
-        assert (found.unusable == 0) == everywhere, (family, found)
+        assert (found.pop("unusable") == 0) == everywhere
+        assert not any(found.values()), (family, found)
 
 
 def spoilt(sampler, name, value=np.nan, seed=0):
@@ -198,17 +198,9 @@ REFUSED = {
         lambda _: SLOTS.with_planes(UP, [[0.0, 0.0, 0.0]]),
         "plane normals must be of some length, got [[0.0, 0.0, 0.0]]",
     ),
-    "an end at infinity": (
-        lambda _: SLOTS.with_capsules(UP, [[np.inf, 0.0, 0.0]], 0.1),
-        "ends must be finite, got [[inf, 0.0, 0.0]]",
-    ),
     "a rotation that stretches": (
         lambda _: SLOTS.with_boxes(UP, UP * np.array(1.0) + 1.0, 2 * np.eye(3)[None]),
         "box rotations must be rotation matrices, got [[[2.0, 0.0,",
-    ),
-    "a reflection": (
-        lambda _: SLOTS.with_boxes(UP, np.ones((1, 3)), -np.eye(3)[None]),
-        "box rotations must be rotation matrices, got [[[-1.0, -0.0,",
     ),
     "a negative rounding": (
         lambda _: SLOTS.with_boxes(UP, np.ones((1, 3)), None, -1.0),
@@ -217,10 +209,6 @@ REFUSED = {
     "a negative regulariser": (
         lambda robot: RMPVICES(robot, regularizer=-1.0),
         "regularizer must be finite and not negative, got -1.0",
-    ),
-    "a regulariser that is none": (
-        lambda robot: RMPVICES(robot).replace(regularizer=NAN),
-        "regularizer must be finite and not negative, got nan",
     ),
     "too few links": (
         lambda robot: per_link(robot, [1.0, 2.0]),
@@ -256,17 +244,3 @@ def test_traced_numbers_pass_and_make_the_state_unusable(robot):
         return judged(Inputs(q, q, setpoint, slots, None, None))[1].all
 
     assert [float(flag(x, -1.0)) for x in (1.0, 0.0, NAN, np.inf)] == [1, 0, 0, 0]
-
-
-def test_a_negative_stiffness_is_no_impedance(robot):
-    ctrl = VICES(robot)
-    q = jnp.zeros(3)
-    good = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
-    run = jax.jit(ctrl, compiler_options=QUICK)
-
-    def flag(setpoint: Setpoint) -> float:
-        return float(run(q, q, setpoint, Obstacles.empty()).diagnostics["usable"])
-
-    assert flag(good) == 1.0
-    assert flag(good.replace(kp_pos=-good.kp_pos)) == 0.0
-    assert flag(good.replace(kp_ori=0.0 * good.kp_ori)) == 1.0
