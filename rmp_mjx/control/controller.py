@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 from typing import Any, Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Float, Real
@@ -147,10 +146,11 @@ class ImpedanceController(Pytree, abc.ABC):
         check_state(self.robot.n, q, qd, tau_ext, tau_last)
         check_setpoint(setpoint)
         check_obstacles(obstacles)
-        joints = jax.tree.map(jnp.asarray, (q, qd, tau_ext, tau_last))
-        q, qd, tau_ext, tau_last = joints
-        given = Inputs(q, qd, setpoint, obstacles, tau_ext, tau_last)
-        safe, verdict = judged(given)
+        ext, last = (
+            None if tau is None else jnp.asarray(tau) for tau in (tau_ext, tau_last)
+        )
+        state = jnp.asarray(q), jnp.asarray(qd)
+        safe, verdict = judged(Inputs(*state, setpoint, obstacles, ext, last))
         arm = arm_state(self.robot, safe.q, safe.qd)
         out = self.unguarded(arm, *safe[2:])
         out = self._guarded(out, arm, safe.obstacles, safe.tau_ext)

@@ -179,7 +179,7 @@ def test_half_precision_inputs_can_be_used():
 
 
 NAN = float("nan")
-UP = [[0.0, 0.0, 1.0]]
+UP = np.array([[0.0, 0.0, 1.0]])
 SLOTS: Any = Obstacles.empty(spheres=3, planes=1, capsules=1, boxes=1)
 REFUSED = {
     "a centre that is none": (
@@ -199,7 +199,7 @@ REFUSED = {
         "plane normals must be of some length, got [[0.0, 0.0, 0.0]]",
     ),
     "a rotation that stretches": (
-        lambda _: SLOTS.with_boxes(UP, UP * np.array(1.0) + 1.0, 2 * np.eye(3)[None]),
+        lambda _: SLOTS.with_boxes(UP, UP + 1.0, 2 * np.eye(3)[None]),
         "box rotations must be rotation matrices, got [[[2.0, 0.0,",
     ),
     "a negative rounding": (
@@ -240,7 +240,9 @@ def test_traced_numbers_pass_and_make_the_state_unusable(robot):
     @jax.jit(compiler_options=QUICK)
     def flag(x, eps):
         RMPVICES(robot, regularizer=eps)
-        slots = SLOTS.with_spheres([[x, 0.0, 0.0]], 0.1).with_planes(UP, [[0, 0, x]])
+        slots = SLOTS.with_spheres([[x, 0.0, 0.0]], 0.1).with_planes(
+            UP, [[0.0, 0.0, x]]
+        )
         return judged(Inputs(q, q, setpoint, slots, None, None))[1].all
 
     assert [float(flag(x, -1.0)) for x in (1.0, 0.0, NAN, np.inf)] == [1, 0, 0, 0]
