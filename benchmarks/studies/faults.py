@@ -67,45 +67,44 @@ class Sampler:
     """Plausible inputs of an arm's controllers, as fields and as a tree."""
 
     def __init__(self, robot: rmp.Robot):
-        """Set up for an arm."""
-        self.robot = robot
-        self._make = jax.jit(jax.vmap(self._one))
+        """One state at home; the last slot of each kind is not in use."""
+        self.robot, still = robot, jnp.zeros(robot.n)
+        action = rmp.WeightedActionRange().decode(jnp.zeros(15))
+        at, up = jnp.ones((2, 3)), jnp.eye(3)[2:]
+        slots = rmp.Obstacles.empty(spheres=3, planes=2, capsules=2, boxes=2)
+        one = {
+            "q": jnp.asarray(robot.q_home, jnp.float32),
+            "qd": still,
+            "setpoint": rmp.VICES(robot).setpoint(still, action, jnp.float32(1.0)),
+            "obstacles": slots.with_spheres(at, 0.1)
+            .with_planes(-up, up)
+            .with_capsules(-up, up, 0.1)
+            .with_boxes(up, at[:1], None, 0.1),
+            "tau_ext": still,
+            "tau_last": still,
+        }
+        leaves, self._structure = jax.tree_util.tree_flatten_with_path(one)
+        name = jax.tree_util.keystr
+        self._home = {
+            name(p, simple=True, separator="."): np.asarray(x) for p, x in leaves
+        }
 
     def draw(self, rng: np.random.Generator, batch: int) -> Fields:
         """Inputs of so many states, all of which can be used."""
-        n, robot = self.robot.n, self.robot
-        low, high = (x.clip(-np.pi, np.pi) for x in (robot.q_lower, robot.q_upper))
-        q, qd = rng.uniform(low, high, (batch, n)), rng.normal(size=(batch, n))
-        policy, noise = rng.uniform(-1, 1, (batch, 15)), rng.normal(size=(batch, 27))
-        given = (np.asarray(x, np.float32) for x in (q, qd, policy, noise))
-        made = jax.device_get(self._make(*given))
-        leaves, self._structure = jax.tree_util.tree_flatten_with_path(made)
-        name = jax.tree_util.keystr
-        return {name(p, simple=True, separator="."): np.array(x) for p, x in leaves}
+        fields = {k: np.repeat(x[None], batch, 0) for k, x in self._home.items()}
+        for name in _numbers(fields):
+            x = fields[name]
+            if _last(name) in SIGNLESS:
+                x *= rng.uniform(0.1, 1.0, x.shape)
+            elif _last(name) not in FRAMES:
+                x += 0.3 * rng.normal(size=x.shape)
+        low, high = self.robot.q_lower, self.robot.q_upper
+        fields["q"] = fields["q"].clip(low, high).astype(np.float32)
+        return fields
 
     def tree(self, fields: Fields) -> dict[str, Any]:
         """The arguments of a controller's call."""
         return jax.tree.unflatten(self._structure, list(fields.values()))
-
-    def _one(self, q, qd, policy, noise):
-        action = rmp.WeightedActionRange().decode(policy)
-        x = jnp.array([[0.3, 0.0, 0.3]]) + 0.4 * noise[:18].reshape(6, 3)
-        v = noise[18:].reshape(3, 3)
-        slots = rmp.Obstacles.empty(spheres=3, planes=2, capsules=2, boxes=2)
-        obstacles = (
-            slots.with_spheres(x[:2], 0.05, v[:2], hand_may_touch=v[:2, 0] > 0.0)
-            .with_planes([[0.0, 0.0, -0.1]], x[2:3] + 2.0)
-            .with_capsules(x[3:4], x[4:5], 0.05, v[:1], v[1:2])
-            .with_boxes(x[5:6], [[0.1, 0.2, 0.05]], None, 0.02, v[:1], v[2:])
-        )
-        return {
-            "q": q,
-            "qd": qd,
-            "setpoint": rmp.VICES(self.robot).setpoint(q, action, jnp.float32(1.0)),
-            "obstacles": obstacles,
-            "tau_ext": policy[: self.robot.n],
-            "tau_last": -policy[: self.robot.n],
-        }
 
 
 def _numbers(fields: Fields) -> list[str]:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.studies import faults
-from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, Setpoint, per_link
+from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, per_link
 from rmp_mjx.control.fail_safe import BRAKING_TIME, Inputs, judged
-from rmp_mjx.math import exp_so3
 from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
@@ -121,16 +120,13 @@ def test_a_filter_that_knows_an_obstacle_by_half_solves_nothing(sampler, run):
         assert not found["usable"].any() and not found["solved"].any()
 
 
-@pytest.mark.parametrize(
-    "name", ["vices", pytest.param("rmp_vices", marks=pytest.mark.slow)]
-)
-def test_gradients_are_finite_in_hostile_states(name):
+def test_gradients_are_finite_in_hostile_states():
     """By joints and set-point: zero where the torque does not depend on them.
 
     With six joints or more: VICES inverts the whole operational inertia.
     """
     arm = faults.random_arm(0, joints=7)
-    ctrl, sampler = faults.controllers(arm)[name], faults.Sampler(arm)
+    ctrl, sampler = VICES(arm), faults.Sampler(arm)
 
     @jax.jit(compiler_options=QUICK)
     @jax.vmap
@@ -161,21 +157,6 @@ def test_an_arm_without_pairs_or_obstacles_works_in_every_controller():
         out = jax.eval_shape(ctrl, q, q, setpoint, none)
         assert out.tau.shape == (3,)
         assert out.diagnostics["usable"].dtype == jnp.float32
-
-
-def test_half_precision_inputs_can_be_used():
-    """Rotations and normals of float16 are off by 1e-3, of bfloat16 by 1e-2."""
-    slots = Obstacles.empty(planes=1).with_planes([[0, 0, -1.0]], [[0.3, 0.5, 0.7]])
-    R, ones = exp_so3(jnp.array([0.4, -0.7, 1.1])), jnp.ones(3)
-    setpoint = Setpoint(ones, R, 300.0 * ones, 300.0 * ones, jnp.float32(0.0))
-    given = Inputs(ones, ones, setpoint, slots, None, None)
-    for dtype in (jnp.float16, jnp.bfloat16):
-
-        def half(x, dtype=dtype):
-            return x if x.dtype == bool else x.astype(dtype)
-
-        safe, verdict = judged(jax.tree.map(half, given))
-        assert verdict.all and safe.q.dtype == dtype
 
 
 NAN = float("nan")
