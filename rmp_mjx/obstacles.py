@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -102,7 +103,7 @@ class Obstacles(Pytree):
         kept, good = [], []
         for slots in vars(self).values():
             sound = slots.sound()
-            kept.append(slots.where(sound & slots.active))
+            kept.append(_only(slots, sound & slots.active))
             good.append(jnp.all(sound | ~jnp.asarray(slots.active)))
         return Obstacles(*kept), jnp.all(jnp.stack(good))
 
@@ -275,6 +276,16 @@ class Obstacles(Pytree):
             hand_may_touch=hand_may_touch,
         )
         return self.replace(boxes=boxes)
+
+
+def _only(slots: Kind, use: Array) -> Kind:
+    """The slots with zeros where they are not used."""
+
+    def kept(x: Constant) -> Array:
+        wide = use.reshape(-1, *(1,) * (jnp.ndim(x) - 1))
+        return jnp.where(wide, x, jnp.zeros((), jnp.asarray(x).dtype))
+
+    return jax.tree.map(kept, slots)
 
 
 def _check_vectors(**given: Numbers | None) -> None:

@@ -18,9 +18,8 @@ from __future__ import annotations
 import abc
 import functools
 import operator
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -74,15 +73,6 @@ class Shape(Pytree, abc.ABC):
         sizes = [jnp.abs(x) for x in fields if x.dtype != bool]
         small = [jnp.all(x <= LARGEST, axis=range(1, x.ndim)) for x in sizes]
         return functools.reduce(operator.and_, small)
-
-    def where(self, use: Bool[Array, " o"]) -> Self:
-        """The slots with zeros, not in use, where the mask (o,) is False."""
-
-        def kept(x: Constant) -> Array:
-            wide = use.reshape(-1, *(1,) * (jnp.ndim(x) - 1))
-            return jnp.where(wide, x, jnp.zeros((), jnp.asarray(x).dtype))
-
-        return jax.tree.map(kept, self)
 
     def greatest_speed(self) -> Float[Array, " o"]:
         """Greatest speed of any point of each obstacle's core, (o,) [m/s]."""
