@@ -57,8 +57,7 @@ class Verdict(NamedTuple):
 def judged(given: Inputs) -> tuple[Inputs, Verdict]:
     """Inputs to compute with, and which of the given ones can be used.
 
-    What cannot be used becomes zero, and an obstacle a slot that is not in use. Zeros
-    also leave the program of usable inputs as it was, bit for bit.
+    What cannot be used becomes zero, and an obstacle a slot that is not in use.
     """
     target = _is_target(given.setpoint)
     obstacles, sound = given.obstacles.cleared()
