@@ -44,18 +44,20 @@ def main(args: Sequence[str] | None = None) -> int:
         for task in options.tasks:
             sim.require(task.physics)
         newer = policies.changed_software(Path(options.run)) if options.run else []
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if newer:
         console.print(f"trained with other software: {', '.join(newer)}")
     runtime.configure(split_cpu=True)
-    env, *others = [envs.make(task) for task in options.tasks]
     try:
+        env, *others = [envs.make(task) for task in options.tasks]
+        evaluate.check_size(env, options.episodes)
         iterations, agent = agent_of(options, config, env, console)
-    except (CheckpointError, ConfigError) as error:
+        options.folder.mkdir(parents=True, exist_ok=True)
+    except (CheckpointError, ConfigError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ConfigError) else 1
+        return 1 if isinstance(error, CheckpointError) else 2
     key = jax.random.key(options.seed)
     filmed = film.EPISODES if options.video else 0
     own, tape = evaluate.record_episodes(env, agent, options.episodes, key, filmed)

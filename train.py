@@ -10,7 +10,8 @@ import envs
 from envs import cli, grid, results
 from rmp_mjx import runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
-from rmp_mjx.training.runs import distributed
+from rmp_mjx.training.evaluation import evaluate
+from rmp_mjx.training.runs import distributed, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
 from rmp_mjx.training.runs.loop import TrainingFailure, TrainResult, train
 from rmp_mjx.training.runs.saving import Commands
@@ -37,15 +38,18 @@ def run(config: TrainConfig, console: Console) -> int:
         return 2
     with lock:
         runtime.configure(split_cpu=distributed.alone())
-        env = envs.make(config.task)
         try:
+            env = envs.make(config.task)
+            evaluate.check_size(env, config.run.eval_episodes)
             result = learn(env, config, folder, console)
-        except (CheckpointError, TrainingFailure, ConfigError) as error:
+            complete = result.had_finished and results.are_complete(config, folder)
+            if not result.exit_code and not complete:
+                results.finish(env, result, config, folder, console)
+        except (CheckpointError, TrainingFailure, ConfigError, OSError) as error:
+            if distributed.is_primary():
+                run_folder.discard(folder)
             print(f"error: {error}", file=sys.stderr)
             return 2 if isinstance(error, ConfigError) else 1
-        complete = result.had_finished and results.are_complete(config, folder)
-        if not result.exit_code and not complete:
-            results.finish(env, result, config, folder, console)
         return result.exit_code
 
 
@@ -58,7 +62,7 @@ def main(args: Sequence[str] | None = None) -> int:
         for config in configs:
             sim.require(config.task.physics)
         distributed.join(**vars(options.processes))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if not distributed.alone():

@@ -21,7 +21,8 @@ from envs.flags import (
 )
 from envs.grid import GRID, Grid, load_grid, open_grid
 from envs.options import Options
-from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.fields import check
+from rmp_mjx.training.config import MOST, SEEDS, ConfigError, TrainConfig
 from rmp_mjx.training.runs import policies
 from rmp_mjx.training.runs.checkpoint import NEWEST
 
@@ -55,11 +56,13 @@ def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid |
     controllers, tasks = given["controllers"], given["envs"]
     if given["resume"]:
         folder = Path(given["resume"])
-        if (folder / GRID).exists():
+        if (folder / GRID).is_file():
             records, those = load_grid(folder)
             saved = {name: from_record(each) for name, each in records.items()}
             controllers = controllers or ",".join(those)
             tasks = tasks or ",".join(saved)
+        elif tasks or controllers:
+            raise ConfigError(f"{folder} is no grid: leave envs and controllers out")
         else:
             config = load_config(folder)
             saved = {config.task.env: config}
@@ -115,8 +118,13 @@ class EvalOptions(Generic[Task]):
         Raises:
             ConfigError: Nothing is evaluated so.
         """
-        if self.episodes < 1:
-            raise ConfigError(f"episodes must be at least 1, is {self.episodes}")
+        check(self, ConfigError)
+        if not 1 <= self.episodes <= MOST:
+            raise ConfigError(
+                f"episodes must be at least 1 and at most {MOST:,}, is {self.episodes}"
+            )
+        if not 0 <= self.seed < SEEDS:
+            raise ConfigError(f"seed must have 32 bits, below {SEEDS:,}")
 
     @property
     def tasks(self) -> list[Options]:

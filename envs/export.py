@@ -68,14 +68,14 @@ def export(options: ExportOptions, note: Callable[[str], None]) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Parse and export; returns the exit code."""
-    options = parse(ExportOptions, args)
-    runtime.configure()
     say = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
     try:
+        options = parse(ExportOptions, args)
+        runtime.configure()
         export(options, say)
-    except (ValueError, CheckpointError) as error:
+    except (ValueError, OSError, CheckpointError) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, soft_wrap=True)
-        return 2 if isinstance(error, ValueError) else 1
+        return 1 if isinstance(error, CheckpointError) else 2
     say(f"written: {options.file}, {options.file.stat().st_size / 1000:.0f} kB")
     return 0
 

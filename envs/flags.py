@@ -15,8 +15,10 @@ import tyro
 
 import envs
 from envs.options import Options
-from rmp_mjx.training.config import ConfigError, TrainConfig, config_of, read_record
+from rmp_mjx.fields import arguments, check
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.policy import is_policy, load_policy
+from rmp_mjx.training.records import config_of, read_record
 from rmp_mjx.training.runs.run_folder import CONFIG
 
 DEFAULT = "trajectory"
@@ -37,6 +39,14 @@ class Processes:
     """Number of this process, from 0."""
     num_processes: int | None = None
     """Number of processes."""
+
+    def __post_init__(self):
+        """Check the values.
+
+        Raises:
+            ConfigError: An option has no such value.
+        """
+        check(self, ConfigError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +96,9 @@ def parse(
 
     Exits with code 2 and a message where the flags are wrong.
 
+    Raises:
+        ValueError: A value is empty.
+
     Args:
         kind: The dataclass.
         args: Command line; None: this process's.
@@ -98,7 +111,7 @@ def parse(
     return tyro.cli(
         tyro.conf.OmitArgPrefixes[kind],
         prog=f"{script} --env {env}" if env else None,
-        args=args,
+        args=arguments(args),
         use_underscores=True,
         console_outputs=not quiet,
         **given,
@@ -109,13 +122,19 @@ def named(args: Sequence[str] | None, *names: str) -> dict[str, str | None]:
     """Values of the flags that decide which others there are.
 
     Raises:
-        ConfigError: Flags of an earlier version.
+        ValueError: Flags of an earlier version, a flag without its value, or an empty
+            value.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser(
+        add_help=False, allow_abbrev=False, exit_on_error=False
+    )
     for name in names:
         parser.add_argument(f"--{name}")
     parser.add_argument("--env_options", "--env-options", nargs="*")
-    found = vars(parser.parse_known_args(args)[0])
+    try:
+        found = vars(parser.parse_known_args(arguments(args))[0])
+    except argparse.ArgumentError as error:
+        raise ConfigError(str(error)) from error
     options = found.pop("env_options")
     if options is not None:
         flags = [f"--{option.replace('=', ' ')}" for option in options]
@@ -134,12 +153,16 @@ def from_record(record: Mapping[str, Any]) -> TrainConfig[Options]:
     Raises:
         ConfigError: It has unknown fields, or values that cannot be run.
     """
-    if "ppo" in record:
-        return config_of(record, lambda task: envs.make_options(**task))
     try:
+        if "ppo" in record:
+            return config_of(record, lambda task: envs.make_options(**task))
         return train_flags(record["env"], _flags(record), quiet=True).config
     except SystemExit as error:
         raise ConfigError("no configuration of this version, nor of 0.1") from error
+    except ConfigError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"no configuration: {error}") from error
 
 
 def _flags(record: Mapping[str, Any]) -> list[str]:
@@ -169,13 +192,13 @@ def load_config(path: Path) -> TrainConfig[Options]:
         ConfigError: It is neither, or its configuration cannot be read.
     """
     if is_policy(path):
-        record = load_policy(path).about["config"]
+        record = load_policy(path).about.get("config", {})
     else:
         path = path / CONFIG
         record = read_record(path)
     try:
         return from_record(record)
-    except (ValueError, KeyError, TypeError) as error:
+    except ConfigError as error:
         raise ConfigError(f"{path} cannot be read as a configuration: {error}") from (
             error
         )

@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rmp_mjx.files import write_text
+from rmp_mjx.files import read_json, write_text
 from rmp_mjx.training.config import (
     ConfigError,
     TrainConfig,
@@ -58,7 +58,7 @@ class Grid:
     def finished(self) -> dict[str, Any]:
         """Iterations and seconds of the cells that have finished."""
         path = self.folder / GRID
-        return json.loads(path.read_text())["finished"] if path.exists() else {}
+        return read_json(path)["finished"] if path.exists() else {}
 
     def save(self, finished: dict[str, Any]) -> None:
         """Write `grid.json`."""
@@ -82,11 +82,14 @@ def load_grid(folder: Path) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]
     """
     path = folder / GRID
     try:
-        saved = json.loads(path.read_text())
+        saved = read_json(path)
         if "config" in saved:  # of version 0.1
             saved["configs"] = {e: saved["config"] | {"env": e} for e in saved["envs"]}
+        for cell in saved.get("finished", {}).values():
+            int(cell["iterations"])
+        ",".join(saved["controllers"])
         return dict(saved["configs"]), tuple(saved["controllers"])
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ConfigError(f"{path} cannot be read as a grid: {error}") from error
 
 
@@ -102,6 +105,8 @@ def open_grid(configs: dict[str, TrainConfig], controllers: tuple[str, ...]) -> 
     else:
         stamp = time.strftime("%Y%m%d-%H%M%S")
         folder = Path(run.run_dir or f"runs/grid-{stamp}")
+        if folder.exists() and not folder.is_dir():
+            raise ConfigError(f"{folder} is no folder")
         if folder.exists() and any(folder.iterdir()):
             raise ConfigError(
                 f"{folder} is not empty: --resume {folder} continues that grid"

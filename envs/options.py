@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
-
-import numpy as np
+from typing import Any, ClassVar, Literal
 
 from envs.placement import Layout
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.vices import OSC
-from rmp_mjx.names import unknown
+from rmp_mjx.fields import check
 
 ControllerName = Literal["rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf"]
 
@@ -26,6 +24,11 @@ CONTROLLERS = {
 
 CTRL_DT = 0.05
 """Seconds per policy step."""
+
+SHORTEST_STEP = 1e-4
+"""Least physics timestep [s]: 500 steps per policy step."""
+MOST_OBSTACLES = 500
+"""Spheres that a task can have."""
 
 _AT_LEAST_ZERO = (
     "obstacles",
@@ -121,15 +124,17 @@ class Options:
         Raises:
             ValueError: An option has no such value; the message lists the valid ones.
         """
-        for name, hint in get_type_hints(type(self)).items():
-            value = getattr(self, name, None)
-            if get_origin(hint) is Literal and value not in get_args(hint):
-                raise ValueError(unknown(name, str(value), get_args(hint)))
+        check(self)
         substeps(self.sim_dt)
         if self.leaf_weights and self.controller != "rmp_vices":
             raise ValueError(
                 "leaf_weights shapes the tree of controller rmp_vices; "
                 f"{self.controller} has none that a policy may shape"
+            )
+        if self.obstacles > MOST_OBSTACLES:
+            raise ValueError(
+                f"obstacles must be at most {MOST_OBSTACLES}, got {self.obstacles}: "
+                "each is a body of the simulation"
             )
         for name in _AT_LEAST_ZERO:
             if not getattr(self, name) >= 0:
@@ -190,8 +195,10 @@ def substeps(sim_dt: float) -> int:
     Raises:
         ValueError: The timestep is not positive or does not divide the policy step.
     """
-    if not (np.isfinite(sim_dt) and 0 < sim_dt <= CTRL_DT):
-        raise ValueError(f"sim_dt must be in (0, {CTRL_DT}] s, got {sim_dt}")
+    if not SHORTEST_STEP <= sim_dt <= CTRL_DT:
+        raise ValueError(
+            f"sim_dt must be in [{SHORTEST_STEP:g}, {CTRL_DT}] s, got {sim_dt}"
+        )
     n = round(CTRL_DT / sim_dt)
     if abs(n * sim_dt - CTRL_DT) > 1e-9:
         raise ValueError(

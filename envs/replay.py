@@ -25,6 +25,7 @@ from rich.table import Table
 import envs
 from envs.flags import from_record
 from rmp_mjx import runtime
+from rmp_mjx.fields import arguments
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.rollout import VALUE_LIMIT
 from rmp_mjx.training.runs import run_folder
@@ -188,17 +189,19 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--limit", type=float, default=VALUE_LIMIT, help="greatest good magnitude"
     )
-    options = parser.parse_args(args)
-    runtime.configure()
     say = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
     try:
+        options = parser.parse_args(arguments(args))
+        if not options.limit > 0:
+            raise ValueError(f"limit must be positive, is {options.limit}")
+        runtime.configure()
         env, state, action, about = read(choose(options.dump))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, soft_wrap=True)
         return 2
     moments: list[Moment] = []
     found = first_bad(policy_step(env, state, action), options.limit, moments)
-    where = ", ".join(f"{k} {about[k]}" for k in ("iteration", "seed", "lane"))
+    where = ", ".join(f"{k} {about[k]}" for k in faults.PLACE)
     table = Table(title=f"{env.name}, {where}")
     table.add_column("greatest magnitude")
     for name in WATCHED:

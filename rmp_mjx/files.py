@@ -1,16 +1,19 @@
-"""Files that are replaced in one move: a killed process leaves the old or the new."""
+"""Files that are replaced in one move, and JSON files that anybody may have damaged."""
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Replace a file by what the body writes to the path that it gets.
 
-    If the body raises, the old file stays and the new one is removed.
+    A process that is killed leaves the old file or the new one. If the body raises, the
+    old file stays and the new one is removed.
 
     Args:
         path: The file; its folder must exist.
@@ -31,3 +34,19 @@ def write_text(path: Path, text: str) -> None:
     """Replace a text file in one move."""
     with replacing(path) as temporary:
         temporary.write_text(text)
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or is no JSON; the message names it.
+    """
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"{path} cannot be read: {reason}") from error

@@ -14,11 +14,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Room -> the rooms that it may import (besides itself). Single modules at the top of
 # the package are rooms of their own; `rmp_mjx` is the public facade.
-GROUND = {"math", "metric", "names", "pytree", "refuse", "trees", "xla"}
+GROUND = {"fields", "math", "metric", "names", "pytree", "refuse", "trees", "xla"}
 BASE = GROUND | {"types", "vec"}
 LAW = {
     "math": set(),
     "metric": {"names"},
+    "fields": {"names"},
     "names": set(),
     "pytree": set(),
     "refuse": set(),
@@ -35,18 +36,19 @@ LAW = {
     "control": BASE | {"rmp", "shapes", "obstacles", "robot"},
     "sim": BASE | {"obstacles", "robot", "runtime"},
     "training": GROUND | {"types", "runtime", "files"},
-    "report": {"files", "training"},
     "check_robot": BASE
     | {"rmp", "shapes", "obstacles", "robot", "control", "sim", "runtime", "files"},
+    "report": {"fields", "files", "training"},
     "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
 }
 # The rooms inside `training`, each with those that it may import.
 TRAINING = {
     "config": set(),
+    "records": {"config"},
     "stats": set(),
     "learning": {"config"},
     "policy": {"config", "learning"},
-    "runs": {"config", "stats", "learning", "policy"},
+    "runs": {"config", "records", "stats", "learning", "policy"},
     "evaluation": {"config", "stats", "learning", "policy", "runs"},
     "brax": {"config", "learning", "policy", "runs"},
 }

@@ -14,7 +14,7 @@ from rmp_mjx.report.__main__ import main
 from rmp_mjx.report.charts import split_curves
 from rmp_mjx.report.page import page, table
 from rmp_mjx.report.runs import grouped, read_config, read_run
-from rmp_mjx.training.config import save_config
+from rmp_mjx.training.records import save_config
 from rmp_mjx.training.runs import run_folder
 
 

@@ -15,6 +15,7 @@ from benchmarks.paper.cells import PRESETS, Cell
 from benchmarks.paper.store import Store
 from envs.flags import parse
 from rmp_mjx import runtime
+from rmp_mjx.fields import check
 from rmp_mjx.training.config import ConfigError
 
 
@@ -41,16 +42,24 @@ class Options:
     allow_changes: bool = False
     """Continue interrupted runs although the code has changed."""
 
+    def __post_init__(self):
+        """Check the values.
+
+        Raises:
+            ConfigError: An option has no such value.
+        """
+        check(self, ConfigError)
+
 
 def main(args: Sequence[str] | None = None) -> int:
     """Parse, do what is missing, report; returns the exit code."""
-    options = parse(Options, args)
-    preset = PRESETS[options.preset]
-    place = Store(options.folder or cells.home(preset))
-    own = place.folder / "page" if preset.name == "smoke" else Path("docs/results")
     console = Console()
     code = 0
     try:
+        options = parse(Options, args)
+        preset = PRESETS[options.preset]
+        place = Store(options.folder or cells.home(preset))
+        own = place.folder / "page" if preset.name == "smoke" else Path("docs/results")
         if options.pack:
             _say(console, place.pack(options.pack))
             return 0
@@ -68,7 +77,7 @@ def main(args: Sequence[str] | None = None) -> int:
             _fingerprints(Store(place.folder), wanted[0])
             return code
         page = report.write(Store(place.folder), preset, options.page or own)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return code or 2
     _say(console, [page])

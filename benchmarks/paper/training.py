@@ -23,13 +23,9 @@ from benchmarks.paper import cells, store
 from benchmarks.paper.cells import Cell, Preset
 from benchmarks.paper.deployment import deploy, is_deployed
 from benchmarks.paper.store import Store
-from rmp_mjx.training.config import (
-    ConfigError,
-    TrainConfig,
-    differing_fields,
-    read_record,
-)
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.policy import PolicyError, load_policy
+from rmp_mjx.training.records import differing_fields, read_record
 from rmp_mjx.training.runs import policies, run_folder
 from rmp_mjx.training.runs.checkpoint import CheckpointError
 from rmp_mjx.training.runs.loop import TrainResult, train

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from rmp_mjx.fields import arguments
 from rmp_mjx.files import write_text
 from rmp_mjx.report.page import page
 from rmp_mjx.report.runs import grouped, read_run
@@ -21,14 +22,15 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, default=Path("page.html"), help="the page to write"
     )
-    options = parser.parse_args(args)
     try:
+        options = parser.parse_args(arguments(args))
         groups = grouped(run for folder in options.runs for run in read_run(folder))
-    except ValueError as error:
+        text = page(groups)
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        write_text(options.out, text)
+    except (ValueError, OSError) as error:
         _say(Console(stderr=True), f"error: {error}")
         return 2
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(options.out, page(groups))
     count = sum(len(group.runs) for group in groups)
     _say(Console(), f"{len(groups)} groups, {count} runs: {options.out}")
     return 0

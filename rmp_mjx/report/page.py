@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import json
 import time
 from collections.abc import Sequence
 
@@ -124,8 +123,7 @@ def _sources(groups: Sequence[Group]) -> list[list[str]]:
 
 def _origin(run: Run) -> list[str]:
     """Software, device and time of a run's last start."""
-    path = run.folder / run_folder.VERSIONS
-    last = json.loads(path.read_text())[-1] if path.exists() else {}
+    last = run_folder.last_start(run.folder)
     software = f"{last.get('git', '?')}, jax {last.get('jax', '?')}"
     return [software, last.get("device", "?"), last.get("started", "?")]
 

@@ -2,46 +2,25 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from rmp_mjx.training.config import (
-    PPOConfig,
-    RunConfig,
-    TrainConfig,
-    config_of,
-    defining,
-    read_record,
-)
+from rmp_mjx.files import read_json
+from rmp_mjx.training.config import PPOConfig, RunConfig, TrainConfig
+from rmp_mjx.training.records import RecordedTask, config_of, defining, read_record
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.metrics import SEED
 
 COLORS = ("#2a6fbb", "#c0504d", "#d9a13b", "#4f9d69", "#7d5ba6", "#5b5b5b")
 """One for each group, repeated."""
+COLUMNS = ("iteration", "steps", "nonfinite_envs", "time/steps_per_s")
+"""Columns that the rows of every run have."""
 SEEDS = ("seed", "num_seeds")
 """Options in which the runs of a group may differ."""
-
-
-@dataclass(frozen=True)
-class RecordedTask:
-    """A task's options as a run folder has them; the task itself is not needed."""
-
-    options: Mapping[str, Any]
-    """Options by name."""
-
-    @property
-    def title(self) -> str:
-        """Task and controller, as far as they are recorded."""
-        words = (self.options.get(name) for name in ("env", "controller"))
-        return ", ".join(str(word) for word in words if word)
-
-    def record(self) -> dict[str, Any]:
-        """The options by name."""
-        return dict(self.options)
 
 
 @dataclass(frozen=True)
@@ -111,22 +90,39 @@ def read_run(folder: Path) -> list[Run]:
     """A run's seeds.
 
     Raises:
-        ValueError: The folder is no run, or has no rows yet.
+        ValueError: The folder is no run, has no rows yet, or a file is damaged.
     """
     config = read_config(folder)
     path = folder / run_folder.METRICS
     if not path.exists():
         raise ValueError(f"{folder} has no rows yet: no {path.name}")
-    rows = pl.read_parquet(path)
+    try:
+        rows = pl.read_parquet(path)
+        numbers = rows.select(COLUMNS).cast(pl.Float64)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    if numbers.is_empty():
+        raise ValueError(f"{folder} has no rows yet: {path.name} is empty")
     if SEED not in rows.columns:
         rows = rows.with_columns(pl.lit(config.ppo.seed).alias(SEED))
     runs = []
-    for k, place in enumerate(run_folder.seed_folders(config, folder)):
-        own = rows.filter(pl.col(SEED) == config.ppo.seed + k)
-        file = place / run_folder.EVALUATION
-        evaluation = json.loads(file.read_text()) if file.exists() else {}
-        runs.append(Run(folder, config, config.ppo.seed + k, own, evaluation))
+    for (seed,), own in rows.group_by(SEED, maintain_order=True):
+        place = run_folder.seed_folder(config, folder, seed)
+        evaluation = _evaluation(place / run_folder.EVALUATION)
+        runs.append(Run(folder, config, seed, own, evaluation))
     return runs
+
+
+def _evaluation(path: Path) -> dict[str, Any]:
+    """The numbers of an evaluation by name; empty if there is none.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    found = read_json(path) if path.exists() else {}
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} is no evaluation")
+    return {name: value for name, value in found.items() if type(value) in (int, float)}
 
 
 def grouped(runs: Iterable[Run]) -> list[Group]:

@@ -1,13 +1,20 @@
-"""Training configuration: three small dataclasses, checked when they are made."""
+"""Training configuration: small dataclasses, checked when they are made."""
 
 import dataclasses
-import json
-from collections.abc import Callable, Mapping
-from pathlib import Path
+import math
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-from rmp_mjx.files import write_text
+from rmp_mjx.fields import check
 from rmp_mjx.names import unknown
+
+SEEDS = 2**32
+"""Seeds have 32 bits: JAX would take a larger one for another."""
+
+
+MOST = 2**30
+"""The largest size: JAX counts with 32 bits, and some counts are sums of two."""
+LOG_STD_LIMIT = 20.0
+"""Magnitude of an initial log standard deviation: actions are within [-1, 1]."""
 
 
 class ConfigError(ValueError):
@@ -34,6 +41,13 @@ def _at_least_one(config: Any, *names: str) -> None:
     for name in names:
         if getattr(config, name) < 1:
             raise ConfigError(f"{name} must be at least 1, is {getattr(config, name)}")
+
+
+def _at_most(most: int, config: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if max(value) > most if isinstance(value, tuple) else value > most:
+            raise ConfigError(f"{name} must be at most {most:,}")
 
 
 def _positive(config: Any, *names: str) -> None:
@@ -103,6 +117,7 @@ class PPOConfig:
         Raises:
             ConfigError: Something cannot be run; the message names the option.
         """
+        check(self, ConfigError)
         _at_least_one(
             self,
             "num_envs",
@@ -122,13 +137,23 @@ class PPOConfig:
             "reward_scaling",
         )
         _not_negative(self, "entropy_cost", "vf_coefficient", "target_kl", "seed")
+        if self.seed + self.num_seeds > SEEDS:
+            raise ConfigError(f"seed must have 32 bits, the last is below {SEEDS:,}")
+        if not abs(self.init_log_std) <= LOG_STD_LIMIT:
+            raise ConfigError(
+                f"init_log_std must lie within +-{LOG_STD_LIMIT:g}, is "
+                f"{self.init_log_std}"
+            )
         for name in ("discounting", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ConfigError(
                     f"{name} must lie in [0, 1], is {getattr(self, name)}"
                 )
+        sizes = "num_envs num_seeds unroll_length num_groups num_updates_per_batch"
+        _at_most(MOST, self, *sizes.split(), "num_minibatches")
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             raise ConfigError(f"hidden_sizes must be positive, is {self.hidden_sizes}")
+        _at_most(MOST, self, "hidden_sizes")
         if self.steps_per_iteration % self.num_minibatches:
             raise ConfigError(
                 f"num_envs * unroll_length = {self.num_envs} * {self.unroll_length} = "
@@ -144,12 +169,12 @@ class PPOConfig:
     @property
     def groups(self) -> int:
         """Groups of environments: the most, up to `num_groups`, that divide evenly."""
+        both = math.gcd(self.num_groups, self.num_envs)
+        small = [n for n in range(1, math.isqrt(both) + 1) if both % n == 0]
         return max(
             n
-            for n in range(1, self.num_groups + 1)
-            if self.num_groups % n == 0
-            and self.num_envs % n == 0
-            and self.num_envs // n * self.unroll_length % self.num_minibatches == 0
+            for n in (*small, *(both // n for n in small))
+            if self.num_envs // n * self.unroll_length % self.num_minibatches == 0
         )
 
 
@@ -196,6 +221,7 @@ class RunConfig:
         Raises:
             ConfigError: Something cannot be run; the message names the option.
         """
+        check(self, ConfigError)
         _at_least_one(
             self,
             "num_timesteps",
@@ -204,6 +230,7 @@ class RunConfig:
             "checkpoints_kept",
         )
         _not_negative(self, "keep_every", "eval_episodes")
+        _at_most(MOST, self, "eval_episodes")
         if self.num_devices is not None:
             _at_least_one(self, "num_devices")
         if self.keep_every % self.checkpoint_interval:
@@ -239,6 +266,7 @@ class TrainConfig(Generic[AnyTask]):
         Raises:
             ConfigError: Something cannot be run; the message names the option.
         """
+        check(self, ConfigError)
         if self.trainer == "brax" and self.run.resume:
             raise ConfigError("trainer brax cannot resume a run")
         if self.trainer == "brax" and self.ppo.num_seeds > 1:
@@ -296,92 +324,3 @@ class TrainConfig(Generic[AnyTask]):
             "run": dataclasses.asdict(self.run),
             "trainer": self.trainer,
         }
-
-
-def defining(record: Mapping[str, Any]) -> dict[str, Any]:
-    """What defines a run, by flat name: its task, its learning, its trainer.
-
-    Args:
-        record: `TrainConfig.record()`, or what JSON gives back of it.
-    """
-    trainer = {"trainer": record["trainer"]} if "trainer" in record else {}
-    return {**record.get("task", {}), **record.get("ppo", {}), **trainer}
-
-
-def differing_fields(
-    saved: Mapping[str, Any], config: TrainConfig
-) -> dict[str, tuple[Any, Any]]:
-    """Options that define a run and differ between a saved record and a configuration.
-
-    What an older record does not say has its default.
-
-    Raises:
-        ConfigError: The record is of version 0.1.
-    """
-    if "ppo" not in saved:
-        raise ConfigError(
-            "a run of version 0.1 cannot be resumed: evaluate it as it is, or finish "
-            "it with that version"
-        )
-    usual = TrainConfig(type(config.task)())
-    default, given, new = (
-        defining(json.loads(json.dumps(record)))
-        for record in (usual.record(), saved, config.record())
-    )
-    old = default | given
-    return {
-        name: (old.get(name), new.get(name))
-        for name in old | new
-        if old.get(name) != new.get(name)
-    }
-
-
-def save_config(config: TrainConfig, path: Path, **more: Any) -> None:
-    """Write a configuration as JSON, and what else is to be kept with it."""
-    write_text(path, json.dumps(config.record() | more, indent=2) + "\n")
-
-
-def config_of(
-    record: Mapping[str, Any], task: Callable[[Mapping[str, Any]], AnyTask]
-) -> TrainConfig[AnyTask]:
-    """A configuration from a record that JSON gives back; missing fields take defaults.
-
-    Args:
-        record: As `TrainConfig.record` makes it.
-        task: The task's options from their part of the record.
-
-    Raises:
-        ConfigError: An unknown field, or a value that cannot be run.
-    """
-    ppo: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in record["ppo"].items()
-    }
-    try:
-        return TrainConfig(
-            task(record["task"]),
-            PPOConfig(**ppo),
-            RunConfig(**record["run"]),
-            record.get("trainer", "ours"),
-        )
-    except (TypeError, ValueError) as error:
-        raise ConfigError(str(error)) from error
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """The record in a file written by `save_config`.
-
-    Raises:
-        ConfigError: The file is missing, is not JSON, or is no record.
-    """
-    try:
-        record = json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path.parent} is no run folder: no {path.name}") from error
-    except json.JSONDecodeError as error:
-        raise ConfigError(f"{path} cannot be read as a configuration: {error}") from (
-            error
-        )
-    if not isinstance(record, dict):
-        raise ConfigError(f"{path} cannot be read as a configuration: no JSON object")
-    return record

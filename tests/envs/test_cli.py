@@ -15,10 +15,8 @@ from rmp_mjx.training.config import (
     ConfigError,
     PPOConfig,
     RunConfig,
-    differing_fields,
-    read_record,
-    save_config,
 )
+from rmp_mjx.training.records import differing_fields, read_record, save_config
 
 OLD = Path(__file__).with_name("config-0.1.json")
 """A configuration as version 0.1 wrote it."""

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.learning.ppo import make_ppo
-from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs import identity, run_folder
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.loop import train
 from rmp_mjx.training.runs.saving import Commands
@@ -54,7 +54,11 @@ def newest_state(folder, config):
     """Number and state of the newest checkpoint of a counting toy's run."""
     ppo = make_ppo(toys.Counter(), config.ppo)
     template = jax.eval_shape(ppo.init, jax.random.key(0))
-    store = Checkpointer(folder / run_folder.CHECKPOINTS, read_only=True)
+    store = Checkpointer(
+        folder / run_folder.CHECKPOINTS,
+        read_only=True,
+        run_id=identity.run_id(folder / run_folder.CONFIG),
+    )
     step, state = store.restore(template, pytest.fail)
     store.close()
     return step, state

@@ -17,7 +17,7 @@ from rmp_mjx.training.learning.learner import Learner, TrainState
 from rmp_mjx.training.learning.networks import make_agent, make_networks
 from rmp_mjx.training.learning.ppo import MIN_OBS_STD
 from rmp_mjx.training.learning.rollout import Env, RolloutStats
-from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs import identity, run_folder
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.loop import TrainResult
@@ -129,8 +129,9 @@ def train(
     console = console or Console()
     given = arguments(env, config)
     kept, place = config.run.checkpoints_kept, folder / run_folder.CHECKPOINTS
-    checkpoints = Checkpointer(place, kept, config.run.keep_every)
-    run_folder.describe(folder, config, env)
+    run_id = identity.new_run()
+    run_folder.describe(folder, config, env, run_id)
+    checkpoints = Checkpointer(place, kept, config.run.keep_every, run_id=run_id)
     used = run_folder.device(given["max_devices_per_host"])
     console.print(f"training with Brax's PPO on {used}", highlight=False)
     console.print(

@@ -14,7 +14,7 @@ from rmp_mjx.metric import SUCCESS, Metric, reductions
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.evaluation import recording
 from rmp_mjx.training.evaluation.recording import Recording
-from rmp_mjx.training.learning import devices, episodes
+from rmp_mjx.training.learning import devices, episodes, memory
 from rmp_mjx.training.learning.episodes import EpisodeFold
 from rmp_mjx.training.learning.networks import Agent
 from rmp_mjx.training.learning.rollout import Env, finite_step
@@ -66,6 +66,7 @@ def recorder(
     env: Env, num_episodes: int, recorded: int
 ) -> Callable[[Agent, PRNGKeyArray], tuple[Episodes, Recording]]:
     """`record_episodes` for several agents; compiled once for those of one network."""
+    check_size(env, num_episodes)
     run = jax.jit(partial(play, env, num_episodes, min(recorded, num_episodes)))
     steps = min(env.episode_length, recording.MAX_STEPS)
 
@@ -76,6 +77,25 @@ def recorder(
         return results, Recording(tape, lengths)
 
     return record
+
+
+def check_size(env: Env, num_episodes: int) -> None:
+    """Refuse more episodes than memory can hold, results before and after a step.
+
+    Args:
+        env: Single environment.
+        num_episodes: Number of episodes.
+
+    Raises:
+        ConfigError: There is less memory.
+    """
+
+    def held():
+        fold = episodes.start(reductions(env.metrics), (num_episodes,))
+        return fold, jax.random.split(jax.random.key(0), num_episodes)
+
+    needed = 2 * memory.size(jax.eval_shape(held))
+    memory.check(needed, jax.local_devices(), "the number of episodes")
 
 
 class _Lanes(Pytree):

@@ -1,6 +1,8 @@
 """Steps that became non-finite: kept on the device, written to files for a replay."""
 
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,20 @@ from rmp_mjx.trees import like, named_leaves, numbers
 
 ACTION, ABOUT = "action", "about"
 """Entries of a file in addition to the leaves of the state."""
+PLACE = ("iteration", "seed", "lane")
+"""What a file says of where its step was."""
+_UNREADABLE = (
+    OSError,
+    KeyError,
+    IndexError,
+    TypeError,
+    ValueError,
+    RecursionError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""How NumPy, zip and JSON say that a file is damaged or something else."""
 
 
 class Fault(Pytree):
@@ -77,18 +93,23 @@ def load(path: Path, template: Any) -> tuple[Any, Float[np.ndarray, " m"]]:
         The state before the step, and the action.
 
     Raises:
-        ValueError: The file is of another task.
+        ValueError: The file is of another task, or damaged.
     """
-    with np.load(path) as stored:
-        wanted = named_leaves(template)
-        missing = wanted.keys() - set(stored.files)
-        if missing:
-            raise ValueError(f"{path} is of another task: no {', '.join(missing)}")
-        leaves = [
-            like(jnp.asarray(stored[name]), leaf) for name, leaf in wanted.items()
-        ]
-        action = stored[ACTION]
-    return jax.tree.unflatten(jax.tree.structure(template), leaves), action
+    wanted = named_leaves(template)
+    try:
+        with np.load(path) as stored:
+            arrays = {name: stored[name] for name in (ACTION, *wanted)}
+    except _UNREADABLE as error:
+        raise ValueError(f"{path} is damaged, or of another task: {error}") from error
+    for name, leaf in wanted.items():
+        shape = jax.eval_shape(numbers, leaf).shape
+        if arrays[name].shape != shape:
+            raise ValueError(
+                f"{path} is of another task: {name} has shape {arrays[name].shape}, "
+                f"not {shape}"
+            )
+    leaves = [like(jnp.asarray(arrays[name]), leaf) for name, leaf in wanted.items()]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves), arrays[ACTION]
 
 
 def about(path: Path) -> dict[str, Any]:
@@ -99,6 +120,7 @@ def about(path: Path) -> dict[str, Any]:
     """
     try:
         with np.load(path) as stored:
-            return json.loads(str(stored[ABOUT]))
-    except (OSError, KeyError, ValueError) as error:
+            found = json.loads(str(stored[ABOUT]))
+        return {name: found[name] for name in ("config", *PLACE)} | found
+    except _UNREADABLE as error:
         raise ValueError(f"{path} is no dump of a non-finite step: {error}") from error

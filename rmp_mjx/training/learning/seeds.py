@@ -5,10 +5,12 @@ With one seed there is no such axis: the program is that of a single agent.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Key
 
@@ -40,7 +42,8 @@ def keys(config: PPOConfig) -> Key[Array, "*k"]:
     """Keys from which the agents start: one key, or (num_seeds,)."""
     if config.num_seeds == 1:
         return jax.random.key(config.seed)
-    return jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
+    first, count = np.uint32(config.seed), config.num_seeds
+    return jax.vmap(jax.random.key)(first + jnp.arange(count, dtype=np.uint32))
 
 
 def programs(env: Env, config: PPOConfig, num_devices: int | None = None) -> Programs:
@@ -80,4 +83,4 @@ def of_seed(tree: Any, index: int, config: PPOConfig) -> Any:
 def shapes(ppo: PPO, config: PPOConfig) -> TrainState:
     """Shapes and dtypes of the state of all seeds."""
     init = jax.vmap(ppo.init) if config.num_seeds > 1 else ppo.init
-    return jax.eval_shape(init, keys(config))
+    return jax.eval_shape(init, jax.eval_shape(partial(keys, config)))

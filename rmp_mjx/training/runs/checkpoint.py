@@ -1,17 +1,21 @@
 """Checkpoints: atomic, verified, complete.
 
 A checkpoint is a flat set of arrays written by Orbax (temporary folder, then a
-rename), beside a manifest with every array's path, shape, dtype and SHA-256: Orbax
-itself neither detects a flipped bit nor refuses another dtype. Zero-size arrays,
-which Orbax cannot store, come from the template; PRNG keys are stored as their data.
+rename), beside a manifest with every array's path, shape, dtype and SHA-256, the name
+of the run and the number of the step: Orbax itself neither detects a flipped bit nor
+refuses another dtype. The sums of all files are added last and compared before Orbax
+opens them, because it reports damage with one traceback for each array. Zero-size
+arrays, which Orbax cannot store, come from the template; PRNG keys are stored as their
+data.
 """
 
 import contextlib
+import gc
 import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +25,13 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as retention
 
+from rmp_mjx.files import read_json, write_text
 from rmp_mjx.trees import like, named_leaves, numbers
 
 NEWEST, BEST = "newest", "best"
 """Checkpoints that have a name besides their number."""
+SUMS = "sums.json"
+"""File of a checkpoint with the SHA-256 of all others."""
 MERITS = ("success", "return")
 """Means over recent episodes that rank checkpoints; the first counts most."""
 
@@ -34,7 +41,7 @@ class CheckpointError(RuntimeError):
 
 
 class CheckpointMismatch(CheckpointError):
-    """The checkpoint belongs to another configuration or task."""
+    """The checkpoint belongs to another configuration, task or run."""
 
 
 class SaveError(CheckpointError):
@@ -50,8 +57,34 @@ def _describe(path: str, array: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _digest(arrays: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(arrays, sort_keys=True).encode()).hexdigest()
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _sums(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file of a checkpoint, by its path in there."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != SUMS)
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(
+            path.read_bytes()
+        ).hexdigest()
+        for path in sorted(files)
+    }
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the errors of Orbax's own tasks, which it also raises, off the terminal."""
+    logger = logging.getLogger("asyncio")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    except Exception:
+        gc.collect()  # a task speaks when it is collected
+        raise
+    finally:
+        logger.setLevel(level)
 
 
 def _rank(merit: Mapping[str, float]) -> tuple[float, ...]:
@@ -67,6 +100,7 @@ class Checkpointer:
         keep: int = 3,
         keep_every: int = 0,
         read_only: bool = False,
+        run_id: str | None = None,
     ):
         """Open a folder of checkpoints.
 
@@ -75,15 +109,20 @@ class Checkpointer:
             keep: Newest checkpoints that are kept; so is the best one.
             keep_every: Checkpoints at multiples of this are kept too; 0: none.
             read_only: Do not create or clean up anything.
+            run_id: Name of the run; None: it has none.
+
+        Raises:
+            CheckpointError: There is no such folder.
         """
         for name in ("absl", "orbax"):  # they narrate every save at INFO and WARNING
             logging.getLogger(name).setLevel(logging.ERROR)
         self._folder = folder.absolute()
         self._read_only = read_only
-        if read_only and not self._folder.is_dir():
+        self._run_id = run_id
+        if not read_only and not self._folder.exists():
+            self._folder.mkdir(parents=True)
+        if not self._folder.is_dir():
             raise CheckpointError(f"no checkpoints in {folder}")
-        if not read_only:
-            self._folder.mkdir(parents=True, exist_ok=True)
         kept = [
             retention.LatestN(keep),
             retention.BestN(
@@ -135,18 +174,20 @@ class Checkpointer:
                 name = f"{index:05d}"
                 arrays[name] = array
                 manifest[name] = _describe(path, array)
+        content = {"arrays": manifest, "run": self._run_id, "step": step}
         try:
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
                     state=ocp.args.StandardSave(arrays),
-                    manifest=ocp.args.JsonSave(
-                        {"arrays": manifest, "sha256": _digest(manifest)}
-                    ),
+                    manifest=ocp.args.JsonSave(content | {"sha256": _digest(content)}),
                 ),
                 metrics=dict(merit) if merit else None,
             )
             self._manager.wait_until_finished()
+            own = self._folder / str(step)
+            if own.is_dir():  # not what Orbax has deleted already
+                write_text(own / SUMS, json.dumps(_sums(own)))
         except Exception as error:  # Orbax's errors share no base class
             with contextlib.suppress(Exception):
                 self._manager.close()
@@ -169,7 +210,9 @@ class Checkpointer:
             Step number and the state.
 
         Raises:
-            CheckpointMismatch: Arrays are missing or have other shapes or dtypes.
+            CheckpointMismatch: It is a checkpoint of another run, or has another number
+                than it was saved with; or arrays are missing or have other shapes or
+                dtypes.
             CheckpointError: There is no sound checkpoint.
         """
         steps = self.steps
@@ -187,6 +230,8 @@ class Checkpointer:
         for step in steps:
             try:
                 stored = self._read(step)
+            except CheckpointMismatch:
+                raise
             except Exception as error:  # Orbax's errors share no base class
                 note(
                     f"checkpoint {step} is damaged, trying an older one: "
@@ -221,23 +266,17 @@ class Checkpointer:
 
     def _read(self, step: int) -> dict[str, np.ndarray]:
         """Arrays by path, every one verified."""
-        manifest = self._manager.restore(
-            step,
-            args=ocp.args.Composite(manifest=ocp.args.JsonRestore()),
-        )["manifest"]
-        if _digest(manifest["arrays"]) != manifest["sha256"]:
-            raise CheckpointError("the manifest fails its checksum")
-        manifest = manifest["arrays"]
+        self._check_files(step)
+        manifest = self._manifest(step)["arrays"]
         shapes = {
             name: np.zeros(entry["shape"], entry["dtype"])
             for name, entry in manifest.items()
         }
-        arrays = self._manager.restore(
-            step,
-            args=ocp.args.Composite(
-                state=ocp.args.StandardRestore(shapes)
-            ),
-        )["state"]
+        with _quiet():
+            arrays = self._manager.restore(
+                step,
+                args=ocp.args.Composite(state=ocp.args.StandardRestore(shapes)),
+            )["state"]
         stored = {}
         for name, entry in manifest.items():
             array = np.asarray(arrays[name])
@@ -245,6 +284,43 @@ class Checkpointer:
                 raise CheckpointError(f"{entry['path']} fails its checksum")
             stored[entry["path"]] = array
         return stored
+
+    def _check_files(self, step: int) -> None:
+        """Compare the files with their sums.
+
+        A process that was killed just before it wrote the sums leaves none, and neither
+        did version 0.2: the arrays have sums of their own.
+        """
+        own = self._folder / str(step)
+        if not (own / SUMS).exists():
+            return
+        wanted, found = read_json(own / SUMS), _sums(own)
+        wrong = [name for name in wanted if wanted[name] != found.get(name)]
+        if wrong:
+            raise CheckpointError(f"{wrong[0]} fails its checksum")
+
+    def _manifest(self, step: int) -> dict[str, Any]:
+        """The manifest of a checkpoint of this run with this number."""
+        with _quiet():
+            manifest = self._manager.restore(
+                step,
+                args=ocp.args.Composite(manifest=ocp.args.JsonRestore()),
+            )["manifest"]
+        content = {name: manifest[name] for name in manifest if name != "sha256"}
+        # Version 0.2 knew neither run nor step, and summed the arrays alone.
+        summed = content if "step" in content else content["arrays"]
+        if _digest(summed) != manifest["sha256"]:
+            raise CheckpointError("the manifest fails its checksum")
+        if content.get("run") != self._run_id:
+            raise CheckpointMismatch(
+                f"checkpoint {step} in {self._folder} is of another run: move it away"
+            )
+        if content.get("step", step) != step:
+            raise CheckpointMismatch(
+                f"checkpoint {step} in {self._folder} is a copy of checkpoint "
+                f"{content['step']}: move it away"
+            )
+        return manifest
 
     def close(self) -> None:
         """Release Orbax's threads."""

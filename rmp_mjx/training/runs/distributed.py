@@ -28,7 +28,8 @@ def join(
     """Join the other processes, if there are any, before JAX opens its backend.
 
     Args:
-        coordinator: HOST:PORT of process 0. None: taken from Slurm (`srun` with more
+        coordinator: HOST:PORT of process 0, which listens on this address and on no
+            other. None: taken from Slurm (`srun` with more
             than one task), else this process is alone.
         process_id: Number of this process.
         num_processes: Number of processes.
@@ -43,13 +44,16 @@ def join(
     if coordinator is not None:
         if process_id is None or num_processes is None:
             raise ConfigError("coordinator needs --process_id and --num_processes")
-        if not coordinator.rpartition(":")[2].isdigit() or ":" not in coordinator:
+        host, _, port = coordinator.rpartition(":")
+        if not (host and port.isdecimal() and 0 < int(port) < 2**16):
             raise ConfigError(f"coordinator must be HOST:PORT, is {coordinator!r}")
         if not 0 <= process_id < num_processes:
             raise ConfigError(
                 f"process_id must be in 0 .. {num_processes - 1}, is {process_id}"
             )
-    jax.distributed.initialize(coordinator, num_processes, process_id)
+    jax.distributed.initialize(
+        coordinator, num_processes, process_id, coordinator_bind_address=coordinator
+    )
 
 
 def _under_slurm() -> bool:

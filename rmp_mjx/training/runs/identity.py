@@ -1,17 +1,19 @@
-"""Which environment a run was trained in: recorded, and compared before it is used.
+"""Which run it is and in which environment it was trained, recorded and compared.
 
 An environment may have an `identity`: what makes it another one although its options
 are the same, for instance its arm. A dictionary from what a thing is to which one it is.
 """
 
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rmp_mjx.training.config import ConfigError, read_record
+from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.records import read_record
 
-KEY = "environment"
-"""Entry of a run's config.json."""
+KEY, RUN = "environment", "run_id"
+"""Entries of a run's config.json."""
 
 
 def of(env: Any) -> dict[str, str]:
@@ -20,8 +22,29 @@ def of(env: Any) -> dict[str, str]:
 
 
 def saved(config: Path) -> dict[str, str]:
-    """The identity in a run's config.json; empty if the run recorded none."""
-    return read_record(config).get(KEY, {}) if config.exists() else {}
+    """The environment's identity in a run's config.json; empty if it recorded none.
+
+    Raises:
+        ConfigError: The file is damaged.
+    """
+    found = read_record(config).get(KEY, {}) if config.exists() else {}
+    if not isinstance(found, dict):
+        raise ConfigError(f"{config}: {KEY} must be a JSON object")
+    return found
+
+
+def new_run() -> str:
+    """A name that no other run has."""
+    return secrets.token_hex(8)
+
+
+def run_id(config: Path) -> str | None:
+    """The name in a run's config.json; None: the run is older than these names.
+
+    Raises:
+        ConfigError: The file is damaged.
+    """
+    return read_record(config).get(RUN) if config.exists() else None
 
 
 def check(before: Mapping[str, str], env: Any, trained: Any) -> None:

@@ -4,13 +4,14 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
 from rich.console import Console
 
 from rmp_mjx.training.runs import distributed, identity, run_folder
-from rmp_mjx.training.learning import seeds
+from rmp_mjx.training.learning import memory, seeds
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.runs.saving import Commands
@@ -70,12 +71,21 @@ def train(
     """
     console = console or Console()
     commands = commands or Commands()
+    run_id = identity.new_run()
     if config.run.resume:
         identity.check(identity.saved(folder / run_folder.CONFIG), env, folder)
+        run_id = identity.run_id(folder / run_folder.CONFIG)
     programs = seeds.programs(env, config.ppo, config.run.num_devices)
-    checkpoints = _open_checkpoints(config, folder)
+    memory.check_training(programs, config.ppo)
+    announce = partial(
+        _announce, env, config, folder, run_id, programs.mesh.size, console
+    )
+    if not config.run.resume:
+        announce()
+    checkpoints = _open_checkpoints(config, folder, run_id)
     state, first = _start(programs, config, checkpoints, console)
-    _announce(env, config, folder, programs.mesh.size, console)
+    if config.run.resume:  # a run that cannot go on stays as it is
+        announce()
     primary = distributed.is_primary()
     logger = _open_logger(env, config, folder, first, console) if primary else None
     note = logger.note if logger else console.print
@@ -177,14 +187,16 @@ class _Loop:
             self.saver.save(done, whole, final)
 
 
-def _open_checkpoints(config: TrainConfig, folder: Path) -> Checkpointer | None:
+def _open_checkpoints(
+    config: TrainConfig, folder: Path, run_id: str | None
+) -> Checkpointer | None:
     """The run's checkpoints; None for a process that neither reads nor writes them."""
     primary = distributed.is_primary()
     if not primary and not config.run.resume:
         return None
     place = folder / run_folder.CHECKPOINTS
     kept, forever = config.run.checkpoints_kept, config.run.keep_every
-    return Checkpointer(place, kept, forever, not primary)
+    return Checkpointer(place, kept, forever, not primary, run_id)
 
 
 def _open_logger(
@@ -198,10 +210,17 @@ def _open_logger(
 
 
 def _announce(
-    env: Env, config: TrainConfig, folder: Path, devices: int, console: Console
-):
+    env: Env,
+    config: TrainConfig,
+    folder: Path,
+    run_id: str | None,
+    devices: int,
+    console: Console,
+) -> None:
     """Write what the run uses into its folder, and print its devices."""
-    changes = run_folder.describe(folder, config, env) if distributed.is_primary() else []
+    changes = []
+    if distributed.is_primary():
+        changes = run_folder.describe(folder, config, env, run_id)
     console.print(f"training on {run_folder.device(devices)}", highlight=False)
     if changes:
         console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)

@@ -1,10 +1,10 @@
 """Policies of runs: found by name, read from checkpoints or files, written to files."""
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from rmp_mjx.files import read_json
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.networks import Agent, make_agent
@@ -78,14 +78,17 @@ def load_agent(
         identity.check(policy.about.get(identity.KEY, {}), env, path)
         agent = policy.agent(env.observation_size, env.action_size, deterministic)
         return policy.about["iterations"], agent
-    identity.check(identity.saved(path / run_folder.CONFIG), env, path)
+    own = path / run_folder.CONFIG
+    identity.check(identity.saved(own), env, path)
     ppo = make_ppo(env, config.ppo)
     whole = seeds.shapes(ppo, config.ppo)
     learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)
     needed = whole.replace(
         learner=learner, scale=None, rollout=None, key=None, iteration=None
     )
-    checkpoints = Checkpointer(path / run_folder.CHECKPOINTS, read_only=True)
+    checkpoints = Checkpointer(
+        path / run_folder.CHECKPOINTS, read_only=True, run_id=identity.run_id(own)
+    )
     step, state = checkpoints.restore(needed, note, checkpoint)
     checkpoints.close()
     stacked = make_agent(
@@ -168,7 +171,7 @@ def describe(
 def evaluation(folder: Path) -> dict[str, Any] | None:
     """The figures of a folder's eval.json that a policy file repeats, if there is one."""
     path = folder / run_folder.EVALUATION
-    return repeated(json.loads(path.read_text())) if path.exists() else None
+    return repeated(read_json(path)) if path.exists() else None
 
 
 def repeated(summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,15 +18,16 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-from rmp_mjx.files import write_text
-from rmp_mjx.training.runs import identity, trackers
-from rmp_mjx.training.config import (
-    ConfigError,
-    TrainConfig,
+from rmp_mjx.files import read_json, write_text
+from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.records import (
+    RecordedTask,
+    config_of,
     differing_fields,
     read_record,
     save_config,
 )
+from rmp_mjx.training.runs import identity, trackers
 
 CONFIG = "config.json"
 VERSIONS = "versions.json"
@@ -89,12 +90,15 @@ def default_run_dir(config: TrainConfig) -> Path:
 
 
 def seed_folders(config: TrainConfig, folder: Path) -> list[Path]:
-    """Where each seed's own results go: the run's folder itself where it has one."""
-    ppo = config.ppo
-    if ppo.num_seeds == 1:
-        return [folder]
-    numbers = range(ppo.seed, ppo.seed + ppo.num_seeds)
-    return [folder / SEEDS / str(number) for number in numbers]
+    """Where the results of each seed go."""
+    first = config.ppo.seed
+    numbers = range(first, first + config.ppo.num_seeds)
+    return [seed_folder(config, folder, number) for number in numbers]
+
+
+def seed_folder(config: TrainConfig, folder: Path, seed: int) -> Path:
+    """Where a seed's results go: the run's folder itself if it has one seed."""
+    return folder if config.ppo.num_seeds == 1 else folder / SEEDS / str(seed)
 
 
 def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
@@ -128,20 +132,61 @@ def open_run(config: TrainConfig) -> tuple[Path, IO[str]]:
         folder = Path(run.run_dir) if run.run_dir else default_run_dir(config)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        strange = not (folder / LOCK).exists()
         lock = _lock(folder)
+        try:
+            if not (run.resume or is_fresh(folder)):
+                _make_room(folder, run.overwrite)
+        except (ConfigError, OSError):
+            if strange:
+                (folder / LOCK).unlink()
+            lock.close()
+            raise
     except OSError as error:
         raise ConfigError(f"cannot write to {folder}: {error.strerror}") from error
-    if not run.resume:
-        others = sorted(p.name for p in folder.iterdir() if p.name != LOCK)
-        if others and not run.overwrite:
-            raise ConfigError(
-                f"{folder} is not empty: --resume {folder} continues that run, "
-                "--overwrite deletes its results"
-            )
-        for name in RESULTS:
-            path = folder / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     return folder, lock
+
+
+def is_fresh(folder: Path) -> bool:
+    """Whether a folder has nothing but a lock."""
+    return all(path.name == LOCK for path in folder.iterdir())
+
+
+def discard(folder: Path) -> None:
+    """Remove a folder that has nothing but a lock; the lock must be held."""
+    if is_fresh(folder):
+        (folder / LOCK).unlink(missing_ok=True)
+        folder.rmdir()
+
+
+def _make_room(folder: Path, overwrite: bool) -> None:
+    """Delete a run's results, and nothing else; links are removed, never followed.
+
+    Raises:
+        ConfigError: They may not go, or they are not certainly those of a run.
+    """
+    if not overwrite:
+        raise ConfigError(
+            f"{folder} is not empty: --resume {folder} continues that run, "
+            "--overwrite deletes its results"
+        )
+    try:
+        if folder.is_symlink():
+            raise ConfigError("it is a link")
+        config_of(read_record(folder / CONFIG), RecordedTask)
+        if not _history(folder):
+            raise ConfigError(f"no {VERSIONS}")
+    except ConfigError as error:
+        raise ConfigError(
+            f"--overwrite deletes the results of a run, and {folder} is not certainly "
+            f"one: {error}"
+        ) from error
+    for name in RESULTS:
+        path = folder / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _lock(folder: Path) -> IO[str]:
@@ -151,11 +196,11 @@ def _lock(folder: Path) -> IO[str]:
             "training needs Linux or macOS: it locks a run's folder with flock, which "
             f"{platform.system()} does not have"
         )
-    lock = (folder / LOCK).open("a+")
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+    lock = os.fdopen(os.open(folder / LOCK, flags, 0o644), "r+")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        lock.seek(0)
         owner = lock.read().strip() or "another process"
         lock.close()
         raise ConfigError(f"{folder} is in use by {owner}") from error
@@ -165,28 +210,50 @@ def _lock(folder: Path) -> IO[str]:
     return lock
 
 
-def describe(folder: Path, config: TrainConfig, env: Any) -> list[str]:
-    """Write the configuration, the environment's identity and the versions of a run.
+def describe(
+    folder: Path, config: TrainConfig, env: Any, run_id: str | None
+) -> list[str]:
+    """Write the configuration, the identities and the versions of a run.
 
     A resumed run adds its versions to those that it was started with.
+
+    Args:
+        folder: Its folder.
+        config: Its configuration.
+        env: Its environment.
+        run_id: What tells it from other runs, see `identity.run_id`.
 
     Returns:
         What has changed since the run was last continued: a resumed run is
         bit-identical to an uninterrupted one only where this is empty.
     """
-    save_config(config, folder / CONFIG, **{identity.KEY: identity.of(env)})
+    identities = {identity.KEY: identity.of(env), identity.RUN: run_id}
+    save_config(config, folder / CONFIG, **identities)
     history, now = _history(folder), versions()
     write_text(folder / VERSIONS, json.dumps([*history, now], indent=2) + "\n")
     return changes_since(history, now)
 
 
 def _history(folder: Path) -> list[dict[str, str]]:
-    """Versions that a run was started and continued with."""
+    """Versions that a run was started and continued with.
+
+    Raises:
+        ConfigError: The file is damaged.
+    """
     path = folder / VERSIONS
     try:
-        return json.loads(path.read_text()) if path.exists() else []
-    except json.JSONDecodeError as error:
-        raise ConfigError(f"{path} is damaged ({error}): delete it to go on") from error
+        history = read_json(path)
+    except FileNotFoundError:
+        return []
+    except ValueError as error:
+        raise ConfigError(f"{error}; delete it to go on") from error
+    if not (
+        isinstance(history, list)
+        and all(isinstance(start, dict) for start in history)
+        and all(isinstance(text, str) for start in history for text in start.values())
+    ):
+        raise ConfigError(f"{path} has no list of versions; delete it to go on")
+    return history
 
 
 def changed_software(folder: Path) -> list[str]:
@@ -194,11 +261,19 @@ def changed_software(folder: Path) -> list[str]:
     return changes_since(_history(folder), software())
 
 
+def last_start(folder: Path) -> dict[str, str]:
+    """What a run was last started or continued on; empty if that is not known.
+
+    Raises:
+        ConfigError: The file is damaged.
+    """
+    return (_history(folder) or [{}])[-1]
+
+
 def trained_with(folder: Path) -> dict[str, str]:
     """Packages, code and device that a run was last continued with."""
-    last = _history(folder)[-1:] or [{}]
-    kept = (*PACKAGES, "python", "git", "device")
-    return {name: last[0][name] for name in kept if name in last[0]}
+    last, kept = last_start(folder), (*PACKAGES, "python", "git", "device")
+    return {name: last[name] for name in kept if name in last}
 
 
 def changes_since(history: list[dict[str, str]], now: dict[str, str]) -> list[str]:

@@ -16,7 +16,8 @@ from tensorboardX.proto.event_pb2 import (
 from tensorboardX.summary import scalar
 
 from rmp_mjx.files import write_text
-from rmp_mjx.training.config import ConfigError, TrainConfig, defining
+from rmp_mjx.training.config import ConfigError, TrainConfig
+from rmp_mjx.training.records import defining
 
 OPTIONAL = ("wandb", "mlflow")
 """Trackers that need an extra. The name is the option, the module and the extra."""

@@ -244,7 +244,7 @@ def test_a_run_whose_checkpoints_are_lost_begins_anew(grid, toy, tmp_path):
     folder = place.folder / "runs" / cell.file
     config = TINY.config(cell).replace(run_dir=str(folder))
     _, lock = run_folder.open_run(config)
-    run_folder.describe(folder, config, None)
+    run_folder.describe(folder, config, None, None)
     damaged = folder / run_folder.CHECKPOINTS / "2"
     damaged.mkdir(parents=True)
     (damaged / "_CHECKPOINT_METADATA").write_text("nonsense")

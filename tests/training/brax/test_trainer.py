@@ -17,9 +17,10 @@ from rich.console import Console
 from rmp_mjx.training.brax import trainer
 from rmp_mjx.training.brax.environment import Batch
 from rmp_mjx.training.brax.replicated import NAME, device_put_replicated
-from rmp_mjx.training.config import ConfigError, TrainConfig, read_record
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.learning import rollout
+from rmp_mjx.training.records import read_record
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.policies import load_agent

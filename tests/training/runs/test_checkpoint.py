@@ -1,17 +1,21 @@
 """Checkpoints: what comes back, and what is refused."""
 
+import json
 import shutil
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rmp_mjx.training.runs import checkpoint
 from rmp_mjx.training.runs.checkpoint import (
     BEST,
     MERITS,
     NEWEST,
+    SUMS,
     Checkpointer,
     CheckpointError,
     CheckpointMismatch,
@@ -119,25 +123,47 @@ def test_a_part_that_was_deleted_is_noticed(folder, part):
     shutil.rmtree(victim) if victim.is_dir() else victim.unlink()
     notes = []
     step, found = restore(folder, notes=notes)
-    assert step == 2 - len(notes)
-    np.testing.assert_array_equal(found["weights"], state(float(step))["weights"])
-    if part != "_CHECKPOINT_METADATA":  # times alone are in there
-        assert part in notes[0]
+    assert step == 1
+    np.testing.assert_array_equal(found["weights"], state(1.0)["weights"])
+    assert part in notes[0]
+
+
+def test_a_checkpoint_that_was_killed_before_its_sums_is_read(folder):
+    """The arrays have sums of their own."""
+    (folder / "2" / SUMS).unlink()
+    assert restore(folder)[0] == 2
 
 
 def data_files(folder):
     return sorted(p for p in folder.rglob("*") if p.is_file() and p.stat().st_size)
 
 
-def flip(folder, path, rng):
-    """Flip one random bit of a file of checkpoint 2; whether 2 is still taken.
-
-    A flip may hit a byte that no reader looks at: then the data must be intact.
-    """
-    content = path.read_bytes()
+def flip(content, rng):
+    """One bit is another."""
     spoilt = bytearray(content)
     spoilt[rng.integers(len(spoilt))] ^= 1 << int(rng.integers(8))
-    path.write_bytes(spoilt)
+    return bytes(spoilt)
+
+
+def truncate(content, rng):
+    """The end is missing."""
+    return content[: rng.integers(len(content))]
+
+
+def replace(content, rng):
+    """All is random."""
+    return rng.bytes(len(content))
+
+
+def delete(content, rng):
+    """There is no such file."""
+
+
+def damage(folder, path, how, rng):
+    """Damage a file of checkpoint 2, and look what is read; whether 2 is still taken."""
+    content = path.read_bytes()
+    spoilt = how(content, rng)
+    path.unlink() if spoilt is None else path.write_bytes(spoilt)
     notes = []
     step, found = restore(folder, notes=notes)
     path.write_bytes(content)
@@ -147,22 +173,81 @@ def flip(folder, path, rng):
     return step == 2
 
 
-def test_a_flipped_bit_is_never_loaded(folder):
+def test_damage_is_never_loaded_and_takes_one_line(folder, caplog, capfd):
+    """Of the sums alone a reader can do without: the arrays have their own."""
     rng = np.random.default_rng(0)
-    taken = [flip(folder, path, rng) for path in data_files(folder / "2")]
-    assert not all(taken)
+    files = data_files(folder / "2")
+    ways = (flip, truncate, replace, delete)
+    for k, path in enumerate(files):
+        taken = damage(folder, path, ways[k % 4], rng)
+        assert not taken or path.name == SUMS
+    assert not caplog.records
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.slow
-def test_three_hundred_flipped_bits_are_never_loaded(folder, capsys):
+@pytest.mark.faults
+def test_three_hundred_damaged_checkpoints_are_never_loaded(folder, capsys):
     rng = np.random.default_rng(1)
     files = data_files(folder / "2")
     sizes = np.array([path.stat().st_size for path in files])
     chosen = rng.choice(len(files), 300, p=sizes / sizes.sum())
-    taken = sum(flip(folder, files[k], rng) for k in chosen)
+    counts = {flip: 150, truncate: 80, replace: 40, delete: 30}
+    ways = [how for how, count in counts.items() for _ in range(count)]
+    taken = 0
+    for k, how in zip(chosen, ways, strict=True):
+        harmless = damage(folder, files[k], how, rng)
+        assert not harmless or files[k].name == SUMS
+        taken += harmless
     with capsys.disabled():
-        sys.stdout.write(f"300 flips, {taken} of them where no reader looks\n")
-    assert taken < 300
+        sys.stdout.write(f"300 damaged, {taken} of them in the sums alone\n")
+
+
+def test_without_sums_damage_of_the_arrays_takes_one_line_too(folder, caplog, capfd):
+    (folder / "2" / SUMS).unlink()
+    largest = max(data_files(folder / "2"), key=lambda p: p.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+    notes = []
+    assert restore(folder, notes=notes)[0] == 1
+    assert len(notes) == 1 and "\n" not in notes[0]
+    assert not caplog.records
+    assert capfd.readouterr() == ("", "")
+
+
+def another(tmp_path, run_id):
+    """Checkpoint 3 of another run of the same shape."""
+    store = Checkpointer(tmp_path / "another", run_id=run_id)
+    store.save(3, state(3.0))
+    store.close()
+    return tmp_path / "another" / "3"
+
+
+def test_a_checkpoint_of_another_run_is_refused(folder, tmp_path):
+    shutil.copytree(another(tmp_path, "b"), folder / "3")
+    with pytest.raises(CheckpointMismatch, match=r"3 in .* is of another run"):
+        restore(folder)
+    assert (folder / "3").is_dir(), "it is not ours to delete"
+
+
+@pytest.mark.parametrize("number", ["4", "1000000000"])
+@pytest.mark.parametrize("put", [shutil.copytree, shutil.move, Path.symlink_to])
+def test_a_checkpoint_with_another_number_is_refused(folder, number, put):
+    one, other = folder / "1", folder / number
+    put(other, one) if put is Path.symlink_to else put(one, other)
+    with pytest.raises(CheckpointMismatch, match=f"{number} in .* is a copy of"):
+        restore(folder)
+
+
+def test_a_checkpoint_of_version_0_2_is_read(folder):
+    """It had neither sums of the files, nor the run and the step in its manifest."""
+    path = folder / "2" / "manifest" / "metadata"
+    arrays = json.loads(path.read_text())["arrays"]
+    old = {"arrays": arrays, "sha256": checkpoint._digest(arrays)}
+    path.write_text(json.dumps(old))
+    (folder / "2" / SUMS).unlink()
+    step, found = restore(folder)
+    assert step == 2
+    np.testing.assert_array_equal(found["weights"], state(2.0)["weights"])
 
 
 def test_a_truncated_file_falls_back_to_the_previous_checkpoint(folder):

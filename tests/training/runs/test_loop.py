@@ -13,7 +13,8 @@ from rich.console import Console
 
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs import loop as train_module
-from rmp_mjx.training.config import ConfigError, config_of, read_record
+from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.records import config_of, read_record
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.policies import load_agent
 from rmp_mjx.training.runs.saving import StopRequest
@@ -166,32 +167,6 @@ def test_the_policy_of_any_kept_checkpoint_can_be_read(finished):
     assert actions["newest"] == actions["4"]
     assert actions["best"] in (actions["2"], actions["4"])
     assert actions["2"] != actions["4"]
-
-
-def test_a_folder_with_results_is_refused_unless_they_may_go(tmp_path):
-    (tmp_path / "config.json").write_text("{}")
-    (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(ConfigError, match="--resume"):
-        run_folder.open_run(small(run_dir=str(tmp_path)))
-    _, lock = run_folder.open_run(small(run_dir=str(tmp_path), overwrite=True))
-    lock.close()
-    assert not (tmp_path / "config.json").exists()
-    assert (tmp_path / "mine.txt").read_text() == "keep"
-
-
-def test_two_runs_cannot_share_a_folder(tmp_path):
-    config = small(run_dir=str(tmp_path))
-    _, lock = run_folder.open_run(config)
-    with pytest.raises(ConfigError, match=f"in use by process {os.getpid()}"):
-        run_folder.open_run(config)
-    lock.close()
-    run_folder.open_run(config)[1].close()
-
-
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="cannot write"):
-        run_folder.open_run(small(run_dir=str(tmp_path / "file" / "run")))
 
 
 def test_resuming_with_another_configuration_names_the_fields(finished):
