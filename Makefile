@@ -2,7 +2,8 @@
 #   make train    set up if needed, then run the main job (ARGS="--seed 1" adds options)
 #   make test     set up if needed, then run the tests
 #   make paper    set up if needed, then run the paper's experiments (PRESET=smoke)
-# The rest: lint type format bench bench-peers bench-gate docs wheel test-latest clean.
+# The rest: lint type format faults bench bench-peers bench-gate docs wheel sbom audit
+#   test-latest clean.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -24,13 +25,14 @@ LATEST := .venv-latest
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 LATEST_STAMP := $(LATEST)/.installed
+TOOLS := build/tools
 PIP := -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help setup train paper test test-slow test-latest lint format type bench \
-  bench-peers bench-gate docs wheel clean
+.PHONY: help setup train paper test test-slow test-latest faults lint format type bench \
+  bench-peers bench-gate docs wheel sbom audit clean
 
 help:
-	@sed -n '1,5s/^#  *//p' Makefile
+	@sed -n '1,6s/^#  *//p' Makefile
 
 setup: $(STAMP)
 
@@ -39,7 +41,7 @@ $(STAMP): requirements.lock pyproject.toml
 	  echo "Python 3.11 not found (the locked set-up is for it): install it, or say"; \
 	  echo "make PYTHON=/path/to/python3.11; for 3.12 see make test-latest"; exit 1; }
 	test -x $(PY) || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
-	$(PY) $(PIP) -r requirements.lock
+	$(PY) $(PIP) --require-hashes -r requirements.lock
 	$(PY) $(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
 
@@ -54,6 +56,10 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(PY) -m pytest -m slow $(ARGS)
+
+# Hostile input in numbers; prints the figures of docs/reliability.md.
+faults: $(STAMP)
+	$(PY) -m pytest -m faults $(ARGS)
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
@@ -83,15 +89,33 @@ bench-gate: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
-# Wheel and sdist, each installed into a fresh environment and tried from another folder.
+# Wheel and sdist, byte for byte the same twice, each installed into a fresh environment
+# and tried from another folder.
 wheel: $(STAMP)
-	rm -rf dist build/installed
+	rm -rf dist build/again build/installed
 	$(PY) -m hatchling build
+	$(PY) -m hatchling build -d build/again
+	diff -r dist build/again
 	$(PY) -m venv build/installed
-	build/installed/bin/python $(PIP) -c requirements.lock dist/*.whl
+	sed -n 's/ .*//; /==/p' requirements.lock > build/constraints.txt
+	build/installed/bin/python $(PIP) -c build/constraints.txt dist/*.whl
 	cd build && installed/bin/python -P ../tests/installed.py
 	build/installed/bin/python $(PIP) --force-reinstall --no-deps dist/*.tar.gz
 	cd build && installed/bin/python -P ../tests/installed.py
+
+# What is installed, and under which licences: build/sbom.json (CycloneDX), licences.md.
+sbom: $(STAMP) $(TOOLS)
+	$(TOOLS)/bin/cyclonedx-py environment --output-file build/sbom.json $(PY)
+	$(TOOLS)/bin/pip-licenses --python $(PY) --format markdown --with-urls \
+	  --output-file build/licences.md
+
+# Known vulnerabilities of what is locked; asks a database on the internet.
+audit: $(TOOLS)
+	$(TOOLS)/bin/pip-audit --require-hashes --disable-pip -r requirements.lock
+
+$(TOOLS): $(STAMP)
+	$(PY) -m venv $@
+	$@/bin/python $(PIP) cyclonedx-bom pip-audit pip-licenses
 
 # Python 3.12 and the newest release of everything.
 test-latest:

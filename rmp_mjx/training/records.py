@@ -89,17 +89,19 @@ def config_of(
     Raises:
         ConfigError: An unknown field, or a value that cannot be run.
     """
-    parts = [record.get(name) for name in ("task", "ppo", "run")]
+    parts: list[Any] = [record.get(name) for name in ("task", "ppo", "run")]
     if not all(isinstance(part, dict) for part in parts):
         raise ConfigError("task, ppo and run must be JSON objects")
     options, ppo, run = parts
-    ppo = {
+    values: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in ppo.items()
     }
     trainer: Any = record.get("trainer", "ours")
     try:
-        return TrainConfig(task(options), PPOConfig(**ppo), RunConfig(**run), trainer)
+        return TrainConfig(
+            task(options), PPOConfig(**values), RunConfig(**run), trainer
+        )
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
 

@@ -25,7 +25,7 @@ def size(tree: Any) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
 
 
-def available(devices: Sequence[jax.Device]) -> int:
+def available(devices: Sequence[Any]) -> int:
     """Bytes of the devices' own memory; of the machine's if they have none."""
     own = [(device.memory_stats() or {}).get("bytes_limit") for device in devices]
     if all(own):
@@ -35,7 +35,7 @@ def available(devices: Sequence[jax.Device]) -> int:
     return min([machine, *(int(text) for text in found if text.isdecimal())])
 
 
-def check(needed: int, devices: Sequence[jax.Device], names: str) -> None:
+def check(needed: int, devices: Sequence[Any], names: str) -> None:
     """Refuse a program that cannot fit.
 
     Args:
