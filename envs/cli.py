@@ -59,6 +59,8 @@ def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid |
         if (folder / GRID).is_file():
             records, those = load_grid(folder)
             saved = {name: from_record(each) for name, each in records.items()}
+            if any(name != config.task.env for name, config in saved.items()):
+                raise ConfigError(f"{folder / GRID} names a task by another's name")
             controllers = controllers or ",".join(those)
             tasks = tasks or ",".join(saved)
         elif tasks or controllers:

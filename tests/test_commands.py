@@ -83,7 +83,7 @@ GRIDS = (
     '{"configs": 5, "controllers": 5}',
     json.dumps({"configs": {"x": RECORD}, "controllers": [5]}),
     json.dumps({"configs": {}, "controllers": [], "finished": {}}),
-    json.dumps({"configs": {"x": RECORD}, "controllers": ["osc"]}),
+    json.dumps({"configs": {"door": RECORD}, "controllers": ["osc"]}),
     json.dumps({"configs": {"x": RECORD}, "controllers": ["osc"], "finished": [1]}),
 )
 """Damaged grid.json."""
@@ -124,7 +124,7 @@ def places(tmp_path, monkeypatch):
     (tmp_path / "loop").symlink_to("loop")
     make_run(tmp_path / "run")
     (tmp_path / "grid").mkdir()
-    cells = {"configs": {"door": RECORD}, "controllers": ["osc"], "finished": {}}
+    cells = {"configs": {"trajectory": RECORD}, "controllers": ["osc"], "finished": {}}
     write(tmp_path / "grid" / "grid.json", json.dumps(cells))
     for name, text in CONFIGS.items():
         make_run(tmp_path / f"config {name}")

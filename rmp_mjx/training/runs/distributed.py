@@ -14,9 +14,9 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
+from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.learning import devices
 from rmp_mjx.training.runs import run_folder
-from rmp_mjx.training.config import ConfigError, TrainConfig
 
 TEXT_SIZE = 4096
 """Bytes of a text that the primary sends to the others."""

@@ -1,7 +1,8 @@
 """Which run it is and in which environment it was trained, recorded and compared.
 
 An environment may have an `identity`: what makes it another one although its options
-are the same, for instance its arm. A dictionary from what a thing is to which one it is.
+are the same, for instance its arm. It is a dictionary from what a thing is to which one
+it is.
 """
 
 import secrets

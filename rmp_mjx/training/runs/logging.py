@@ -1,6 +1,5 @@
 """Where training reports: terminal, parquet file, trackers."""
 
-import os
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path

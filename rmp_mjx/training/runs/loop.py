@@ -10,19 +10,16 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from rmp_mjx.training.runs import distributed, identity, run_folder
-from rmp_mjx.training.learning import memory, seeds
-from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.runs.saving import Commands
+from rmp_mjx.training.learning import memory, seeds
+from rmp_mjx.training.learning.learner import TrainState
+from rmp_mjx.training.learning.networks import Agent, make_agent
+from rmp_mjx.training.learning.rollout import Env
+from rmp_mjx.training.runs import distributed, identity, run_folder
+from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.metrics import Row, make_rows
-from rmp_mjx.training.learning.networks import Agent, make_agent
-from rmp_mjx.training.learning.ppo import make_ppo
-from rmp_mjx.training.learning.learner import TrainState
-from rmp_mjx.training.learning.rollout import Env
-from rmp_mjx.training.runs.saving import Saver
-from rmp_mjx.training.runs.saving import StopRequest, TrainingFailure
+from rmp_mjx.training.runs.saving import Commands, Saver, StopRequest, TrainingFailure
 from rmp_mjx.training.runs.trackers import open_trackers
 from rmp_mjx.training.runs.watch import Watch, is_finite
 

@@ -66,7 +66,7 @@ def make_rows(
     stats: RolloutStats,
     learning: dict[str, Any],
 ) -> list[Row]:
-    """The row of an iteration; with several seeds, one for each, with the column `SEED`."""
+    """The row of an iteration; with several seeds, one each, with the column `SEED`."""
     stats, learning = jax.device_get((stats, learning))
     size = config.steps_per_iteration
     rows = [

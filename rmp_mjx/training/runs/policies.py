@@ -39,7 +39,7 @@ def find(run: str) -> Path:
 
 
 def results_of(path: Path) -> Path:
-    """Where evaluations of a run or a policy go: into the run's folder, or runs/NAME."""
+    """Where evaluations of a run or a policy go: the run's folder, or runs/NAME."""
     if path.suffix != SUFFIX:
         return path
     return path.parent if path.name == run_folder.POLICY else Path("runs") / path.stem
@@ -169,7 +169,7 @@ def describe(
 
 
 def evaluation(folder: Path) -> dict[str, Any] | None:
-    """The figures of a folder's eval.json that a policy file repeats, if there is one."""
+    """The figures of a folder's eval.json that a policy file repeats, if it exists."""
     path = folder / run_folder.EVALUATION
     return repeated(read_json(path)) if path.exists() else None
 

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 
 from rmp_mjx.metric import Metric
-from rmp_mjx.training.learning import faults, seeds
-from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.runs.saving import Commands, then
-from rmp_mjx.training.runs.metrics import SEED, Row
+from rmp_mjx.training.learning import faults, seeds
 from rmp_mjx.training.learning.learner import TrainState
+from rmp_mjx.training.runs import run_folder
+from rmp_mjx.training.runs.metrics import SEED, Row
+from rmp_mjx.training.runs.saving import Commands, then
 
 MAX_LOST_FRACTION = 0.5
 """Training stops if a larger share of an iteration's steps becomes non-finite."""
@@ -38,6 +38,7 @@ class Watch:
             metrics: The environment's metrics.
             folder: Run folder.
             note: Called with one line for each kind of finding, once.
+            commands: The application's commands, for messages.
         """
         self._config = config
         self._meanings = {m.column: m.fault for m in metrics.values() if m.fault}

@@ -12,10 +12,10 @@ from typing import Any
 from rich.console import Console
 
 from rmp_mjx import runtime
+from rmp_mjx.training.runs import distributed
 from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.logging import RunLogger
-from rmp_mjx.training.runs import distributed
 from tests.training import toys
 from tests.training.conftest import SMALL, run, small
 

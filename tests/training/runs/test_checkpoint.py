@@ -160,7 +160,7 @@ def delete(content, rng):
 
 
 def damage(folder, path, how, rng):
-    """Damage a file of checkpoint 2, and look what is read; whether 2 is still taken."""
+    """Damage a file of checkpoint 2 and read; whether 2 is still taken."""
     content = path.read_bytes()
     spoilt = how(content, rng)
     path.unlink() if spoilt is None else path.write_bytes(spoilt)

@@ -11,8 +11,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from rmp_mjx.training.runs import distributed, run_folder
 from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.runs import distributed, run_folder
 from tests.training.conftest import ITERATIONS, SMALL, newest_state, run
 
 PATIENCE = 150
@@ -23,7 +23,13 @@ def start(root, devices, **asked):
     """A process with so many CPU devices that trains the counting toy."""
     flags = f"--xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.training.runs.processes", "member", json.dumps(asked)],
+        [
+            sys.executable,
+            "-m",
+            "tests.training.runs.processes",
+            "member",
+            json.dumps(asked),
+        ],
         cwd=root,
         env={**os.environ, "XLA_FLAGS": flags},
         stdout=subprocess.PIPE,
@@ -42,6 +48,38 @@ def finish(processes):
             process.wait()
     codes = [process.returncode for process in processes]
     return codes, "\n".join(said)
+
+
+LISTENS = """
+import pathlib, sys
+from rmp_mjx.training.runs import distributed
+port = int(sys.argv[1])
+distributed.join(f"127.0.0.1:{port}", 0, 1)
+for table in ("tcp", "tcp6"):
+    for line in pathlib.Path("/proc/net", table).read_text().splitlines()[1:]:
+        address, state = line.split()[1], line.split()[3]
+        if state == "0A" and int(address.split(":")[1], 16) == port:
+            print("listens", address.split(":")[0])
+"""
+"""Says on which addresses process 0 listens."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the tables of Linux")
+def test_process_0_listens_on_the_host_it_was_given_alone(root):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    done = subprocess.run(
+        [sys.executable, "-c", LISTENS, str(port)],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=True,
+    )
+    heard = [line.split()[1] for line in done.stdout.splitlines() if "listens" in line]
+    # 127.0.0.1 in the byte order of the tables, as IPv4 or as IPv6's form of it
+    assert heard and all(host.endswith("0100007F") for host in heard)
 
 
 def steps(iterations):

@@ -12,8 +12,8 @@ import polars as pl
 import pytest
 
 from rmp_mjx.training.runs import run_folder
-from tests.training.runs import processes
 from tests.training.conftest import bits, newest_state, run
+from tests.training.runs import processes
 
 PATIENCE = 120.0
 """Seconds after which a process that says nothing counts as stuck."""
@@ -45,7 +45,14 @@ class Victim:
     def __init__(self, root, folder, *resume):
         self.heard: list[tuple[str, int]] = []
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.training.runs.processes", "victim", str(folder), *resume],
+            [
+                sys.executable,
+                "-m",
+                "tests.training.runs.processes",
+                "victim",
+                str(folder),
+                *resume,
+            ],
             cwd=root,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

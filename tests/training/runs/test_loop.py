@@ -11,10 +11,10 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from rmp_mjx.training.runs import run_folder
-from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.records import config_of, read_record
+from rmp_mjx.training.runs import loop as train_module
+from rmp_mjx.training.runs import run_folder
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.policies import load_agent
 from rmp_mjx.training.runs.saving import StopRequest
@@ -25,7 +25,12 @@ from tests.training.conftest import ITERATIONS, bits, newest_state, run, small
 def test_a_run_leaves_its_configuration_versions_metrics_and_checkpoints(finished):
     folder, result, config = finished
     assert (result.iterations, result.exit_code) == (ITERATIONS, 0)
-    assert config_of(read_record(folder / run_folder.CONFIG), lambda task: toys.Options(**task))== config
+    assert (
+        config_of(
+            read_record(folder / run_folder.CONFIG), lambda task: toys.Options(**task)
+        )
+        == config
+    )
     (versions,) = json.loads((folder / run_folder.VERSIONS).read_text())
     assert {"python", "jax", "brax", "mujoco", "device", "command"} <= set(versions)
     rows = pl.read_parquet(folder / run_folder.METRICS)

@@ -1,12 +1,12 @@
 """Full disks: what is kept, what is said, and when training stops."""
 
-from typing import Any
 import errno
 import io
 import os
 import shutil
 import subprocess
 import sys
+from typing import Any
 
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
@@ -14,12 +14,10 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from rmp_mjx.training.runs.saving import Commands
 from rmp_mjx.training.runs.checkpoint import Checkpointer, SaveError
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.metrics import Row
-from rmp_mjx.training.runs.saving import Saver
-from rmp_mjx.training.runs.saving import TrainingFailure
+from rmp_mjx.training.runs.saving import Commands, Saver, TrainingFailure
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 STATE = {"x": jnp.ones(3)}

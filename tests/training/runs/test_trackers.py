@@ -8,8 +8,8 @@ import sys
 import pytest
 from rich.console import Console
 
-from rmp_mjx.training.runs import run_folder, trackers
 from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.runs import run_folder, trackers
 from rmp_mjx.training.runs.logging import RunLogger
 from rmp_mjx.training.runs.trackers import TensorBoard
 from tests.training.conftest import small
