@@ -14,7 +14,7 @@ from rmp_mjx.metric import SUCCESS, Metric, reductions
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.evaluation import recording
 from rmp_mjx.training.evaluation.recording import Recording
-from rmp_mjx.training.learning import devices, episodes, memory
+from rmp_mjx.training.learning import devices, episodes
 from rmp_mjx.training.learning.episodes import EpisodeFold
 from rmp_mjx.training.learning.networks import Agent
 from rmp_mjx.training.learning.rollout import Env, finite_step
@@ -94,8 +94,8 @@ def check_size(env: Env, num_episodes: int) -> None:
         fold = episodes.start(reductions(env.metrics), (num_episodes,))
         return fold, jax.random.split(jax.random.key(0), num_episodes)
 
-    needed = 2 * memory.size(jax.eval_shape(held))
-    memory.check(needed, jax.local_devices(), "the number of episodes")
+    needed = 2 * devices.size(jax.eval_shape(held))
+    devices.check_memory(needed, jax.local_devices(), "the number of episodes")
 
 
 class _Lanes(Pytree):

@@ -5,7 +5,9 @@ Roll-outs run separately on each device (`per_device`). The rest is one program 
 of the data, which the compiler divides, sums of gradients included.
 """
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,8 +15,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from rmp_mjx.training.config import ConfigError
+from rmp_mjx.trees import numbers
 
 AXIS = "envs"
+LIMITS = ("memory.max", "memory/memory.limit_in_bytes")
+"""Where Linux says how much memory a container may use, below /sys/fs/cgroup."""
 
 
 def make_mesh(groups: int, wanted: int | None = None) -> Mesh:
@@ -86,3 +91,39 @@ def per_device(
     return jax.shard_map(
         function, mesh=mesh, in_specs=specs[0], out_specs=specs[1], check_vma=False
     )
+
+
+def size(tree: Any) -> int:
+    """Bytes of a tree of arrays, or of shapes."""
+    leaves = jax.tree.leaves(jax.eval_shape(numbers, tree))
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
+
+
+def memory(devices: Sequence[Any]) -> int:
+    """Bytes of the devices' own memory; of the machine's if they have none."""
+    own = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in devices]
+    if all(own):
+        return sum(own)
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limits = (Path("/sys/fs/cgroup", name) for name in LIMITS)
+    found = (path.read_text().strip() for path in limits if path.exists())
+    return min([machine, *(int(text) for text in found if text.isdecimal())])
+
+
+def check_memory(needed: int, devices: Sequence[Any], names: str) -> None:
+    """Refuse a program that cannot fit.
+
+    Args:
+        needed: Bytes that it needs at least.
+        devices: What it runs on.
+        names: Options that decide how much it needs, in words.
+
+    Raises:
+        ConfigError: There is less memory; the message has both figures.
+    """
+    most = memory(devices)
+    if needed > most:
+        raise ConfigError(
+            f"this needs at least {needed / 2**30:,.1f} GiB of memory, and there are "
+            f"{most / 2**30:,.1f}: lower {names}"
+        )

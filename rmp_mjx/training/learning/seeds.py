@@ -84,3 +84,25 @@ def shapes(ppo: PPO, config: PPOConfig) -> TrainState:
     """Shapes and dtypes of the state of all seeds."""
     init = jax.vmap(ppo.init) if config.num_seeds > 1 else ppo.init
     return jax.eval_shape(init, jax.eval_shape(partial(keys, config)))
+
+
+def check_memory(programs: Programs, config: PPOConfig) -> None:
+    """Refuse a training that cannot fit, before anything compiles.
+
+    It holds its state, and its data twice: as they were gathered, and in the order of
+    the groups. The first iteration uses the traces that this makes.
+
+    Args:
+        programs: The training.
+        config: Its options.
+
+    Raises:
+        ConfigError: There is less memory.
+    """
+    state = jax.eval_shape(programs.init, jax.eval_shape(partial(keys, config)))
+    _, data, _ = jax.eval_shape(programs.gather, state)
+    every, process = programs.mesh.devices.flat, jax.process_index()
+    own = [device for device in every if device.process_index == process]
+    needed = devices.size(state) + 2 * devices.size(data)
+    names = "num_envs, unroll_length, num_seeds or hidden_sizes"
+    devices.check_memory(needed * len(own) // len(every), own, names)

@@ -11,7 +11,7 @@ import jax
 from rich.console import Console
 
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.learning import memory, seeds
+from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.learner import TrainState
 from rmp_mjx.training.learning.networks import Agent, make_agent
 from rmp_mjx.training.learning.rollout import Env
@@ -73,7 +73,7 @@ def train(
         identity.check(identity.saved(folder / run_folder.CONFIG), env, folder)
         run_id = identity.run_id(folder / run_folder.CONFIG)
     programs = seeds.programs(env, config.ppo, config.run.num_devices)
-    memory.check_training(programs, config.ppo)
+    seeds.check_memory(programs, config.ppo)
     announce = partial(
         _announce, env, config, folder, run_id, programs.mesh.size, console
     )

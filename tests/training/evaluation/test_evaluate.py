@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.evaluation import evaluate, recording
 from rmp_mjx.training.learning.networks import random_agent, zero_agent
 from rmp_mjx.training.runs.policies import load_agent
@@ -159,3 +160,9 @@ def test_bootstrap_interval_is_near_the_normal_one():
 
 def test_bootstrap_of_a_constant_is_that_constant():
     assert bootstrap_mean(np.full(5, 2.0)) == (2.0, 2.0)
+
+
+def test_more_episodes_than_fit_are_refused():
+    evaluate.check_size(toys.Counter(), 10**6)
+    with pytest.raises(ConfigError, match="lower the number of episodes"):
+        evaluate.check_size(toys.Counter(), 2**30)

@@ -112,3 +112,14 @@ def test_an_arm_learns_the_same_on_more_devices_and_among_more_seeds(root):
     )
     assert done.returncode == 0, done.stderr
     assert max(json.loads(done.stdout.splitlines()[-1])) < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("limits", "least", "most"), [([3, 4], 7, 7), ([0], 2**28, 2**50)]
+)
+def test_the_memory_is_the_devices_own_or_the_machines(limits, least, most):
+    class Device:
+        def __init__(self, limit):
+            self.memory_stats = lambda: {"bytes_limit": limit} if limit else None
+
+    assert least <= devices.memory([Device(limit) for limit in limits]) <= most

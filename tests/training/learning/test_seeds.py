@@ -8,8 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.evaluation.evaluate import over_seeds
-from rmp_mjx.training.learning import seeds
+from rmp_mjx.training.learning import devices, seeds
 from rmp_mjx.training.learning.ppo import make_ppo
 from rmp_mjx.training.runs import metrics, run_folder
 from rmp_mjx.training.runs.policies import load_agent
@@ -154,3 +155,25 @@ def test_evaluations_of_seeds_combine_by_interquartile_mean_and_sum():
     assert 1.0 <= low < 3.0 < high <= 90.0
     assert found["return_sd"] == pytest.approx(np.std([1, 2, 4, 90], ddof=1))
     json.dumps(found)
+
+
+LARGE = dict.fromkeys(("num_envs", "unroll_length", "num_seeds"), 2**30)
+LARGE["hidden_sizes"] = (2**30, 2**30)
+
+
+@pytest.mark.parametrize("name", [*LARGE, "all"])
+def test_a_training_that_cannot_fit_is_refused_with_the_estimate(name):
+    config = small(**(LARGE if name == "all" else {name: LARGE[name]})).ppo
+    programs = seeds.programs(toys.Counter(), config)
+    with pytest.raises(ConfigError, match=r"at least [\d,.]+ GiB of memory"):
+        seeds.check_memory(programs, config)
+
+
+def test_the_estimate_is_what_is_held_at_least(monkeypatch):
+    config, needed = small().ppo, []
+    programs = seeds.programs(toys.Counter(), config)
+    monkeypatch.setattr(devices, "check_memory", lambda *given: needed.append(given[0]))
+    seeds.check_memory(programs, config)
+    state, data, _ = programs.gather(programs.init(seeds.keys(config)))
+    nbytes = [sum(x.nbytes for x in jax.tree.leaves(each)) for each in (state, data)]
+    assert needed == [nbytes[0] + 2 * nbytes[1]]
