@@ -15,6 +15,7 @@ import hashlib
 import json
 import logging
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ NEWEST, BEST = "newest", "best"
 """Checkpoints that have a name besides their number."""
 SUMS = "sums.json"
 """File of a checkpoint with the SHA-256 of all others."""
+METRICS = "metrics/metrics"
+"""File of a checkpoint that Orbax keeps its rank in."""
 MERITS = ("success", "return")
 """Means over recent episodes that rank checkpoints; the first counts most."""
 
@@ -75,9 +78,10 @@ def _sums(folder: Path) -> dict[str, str]:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Keep the errors of Orbax's own tasks, which it also raises, off the terminal."""
-    logger = logging.getLogger("asyncio")
+    logger, hook = logging.getLogger("asyncio"), sys.unraisablehook
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)
+    sys.unraisablehook = lambda _: None  # of reads that end after their event loop
     try:
         yield
     except Exception:
@@ -85,6 +89,22 @@ def _quiet() -> Iterator[None]:
         raise
     finally:
         logger.setLevel(level)
+        sys.unraisablehook = hook
+
+
+def _merit(path: Path) -> dict[str, float] | None:
+    """What ranks a checkpoint, from Orbax's file; None if it was not known.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    try:
+        found = read_json(path)
+        return {name: float(found[name]) for name in MERITS}
+    except FileNotFoundError:
+        return None
+    except (ValueError, TypeError, KeyError) as error:
+        raise CheckpointError(f"{path} is damaged") from error
 
 
 def _rank(merit: Mapping[str, float]) -> tuple[float, ...]:
@@ -139,6 +159,7 @@ class Checkpointer:
             enable_async_checkpointing=False,
             create=False,
             read_only=read_only,
+            lightweight_initialize=read_only,  # `_choose` alone needs the ranks
             # each process alone: Orbax would wait for the others otherwise
             multiprocessing_options=ocp.options.MultiprocessingOptions(
                 primary_host=jax.process_index(),
@@ -151,6 +172,11 @@ class Checkpointer:
         if not self._read_only:  # Orbax's own cleaning outlives a closed manager
             for half in self._folder.glob("*.orbax-checkpoint-tmp*"):
                 shutil.rmtree(half, ignore_errors=True)
+            for path in self._folder.glob(f"*/{METRICS}"):
+                try:
+                    _merit(path)
+                except CheckpointError:  # Orbax would not open any of the checkpoints
+                    path.unlink()
         return ocp.CheckpointManager(self._folder, options=self._options)
 
     def save(
@@ -186,8 +212,7 @@ class Checkpointer:
             )
             self._manager.wait_until_finished()
             own = self._folder / str(step)
-            if own.is_dir():  # not what Orbax has deleted already
-                write_text(own / SUMS, json.dumps(_sums(own)))
+            write_text(own / SUMS, json.dumps(_sums(own)))
         except Exception as error:  # Orbax's errors share no base class
             with contextlib.suppress(Exception):
                 self._manager.close()
@@ -248,12 +273,15 @@ class Checkpointer:
     @property
     def steps(self) -> list[int]:
         """Numbers of the checkpoints, sound or not, the newest first."""
-        return sorted(self._manager.all_steps(read=True), reverse=True)
+        afresh = not self._read_only
+        return sorted(self._manager.all_steps(read=afresh), reverse=True)
 
     def _choose(self, which: str, steps: list[int]) -> int:
         """The step of the best checkpoint, or of the one with this number."""
         if which == BEST:
-            merits = ((self._manager.metrics(step), step) for step in steps)
+            merits = (
+                (_merit(self._folder / str(step) / METRICS), step) for step in steps
+            )
             ranked = [(_rank(merit), step) for merit, step in merits if merit]
             if ranked:
                 return max(ranked)[1]

@@ -157,8 +157,12 @@ def test_evaluations_of_seeds_combine_by_interquartile_mean_and_sum():
     json.dumps(found)
 
 
-LARGE = dict.fromkeys(("num_envs", "unroll_length", "num_seeds"), 2**30)
-LARGE["hidden_sizes"] = (2**30, 2**30)
+LARGE = {
+    "num_envs": 2**30,
+    "unroll_length": 2**30,
+    "num_seeds": 2**30,
+    "hidden_sizes": (2**30, 2**30),
+}
 
 
 @pytest.mark.parametrize("name", [*LARGE, "all"])

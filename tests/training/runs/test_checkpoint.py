@@ -37,7 +37,7 @@ def state(offset=0.0):
 def folder(tmp_path):
     store = Checkpointer(tmp_path / "checkpoints")
     store.save(1, state(1.0))
-    store.save(2, state(2.0))
+    store.save(2, state(2.0), dict.fromkeys(MERITS, 0.5))
     store.close()
     return tmp_path / "checkpoints"
 
@@ -126,6 +126,17 @@ def test_a_part_that_was_deleted_is_noticed(folder, part):
     assert step == 1
     np.testing.assert_array_equal(found["weights"], state(1.0)["weights"])
     assert part in notes[0]
+
+
+@pytest.mark.parametrize("content", ["", "5", '{"success": "x"}', "[" * 200_000])
+def test_a_rank_that_is_damaged_counts_as_a_damaged_checkpoint(folder, content):
+    (folder / "2" / "metrics" / "metrics").write_text(content)
+    with pytest.raises(CheckpointError, match="is damaged"):
+        Checkpointer(folder, read_only=True).restore(state(), pytest.fail, BEST)
+    store, notes = Checkpointer(folder), []
+    assert store.restore(state(), notes.append)[0] == 1
+    assert "checkpoint 2 is damaged" in notes[0]
+    store.close()
 
 
 def test_a_checkpoint_that_was_killed_before_its_sums_is_read(folder):
