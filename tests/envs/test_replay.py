@@ -101,7 +101,7 @@ def test_of_a_run_the_earliest_step_is_taken(written, tmp_path):
     with pytest.raises(ValueError, match="has no non-finite steps"):
         replay.choose(tmp_path)
     for iteration in (20, 3):
-        about = {"iteration": iteration, "config": {}}
+        about = {"config": {}, "iteration": iteration, "seed": 0, "lane": 0}
         name = folder / f"iteration{iteration}.npz"
         np.savez(name, about=np.array(json.dumps(about)))
     assert replay.choose(tmp_path) == folder / "iteration3.npz"
