@@ -1,5 +1,6 @@
 """Whatever actuators a file has, the robot's own model has one torque motor a joint."""
 
+import functools
 import warnings
 
 import jax
@@ -229,12 +230,14 @@ def test_it_is_a_choice(sprung, ours):
     np.testing.assert_allclose(bias, data.qfrc_bias, rtol=0.0, atol=1e-11)
 
 
-@pytest.mark.parametrize("controller", [RMPVICES, VICES])
+@pytest.mark.parametrize("controller", [RMPVICES, functools.partial(VICES, kq=0.0)])
 def test_every_controller_gives_the_passive_forces_on_top(sprung, controller):
-    """The torque differs by damping and springs; 1e-4 of 100 N m, in float32."""
+    """The torque differs by damping and springs; 1e-4 of 100 N m, in float32. Three
+    joints cannot do all that VICES asks of a hand, and its solves would multiply the
+    rounding. So no orientation is held, and no posture."""
     bare = sprung.replace(damping=None, stiffness=None, spring_ref=None)
     q, qd = jnp.array([0.2, 0.05, 0.3]), jnp.array([0.3, -0.1, 0.2])
-    action = Action(jnp.zeros(3), jnp.zeros(3), jnp.full(3, 50.0), jnp.full(3, 50.0))
+    action = Action(jnp.zeros(3), jnp.zeros(3), jnp.full(3, 50.0), jnp.zeros(3))
     torques = []
     for robot in (sprung, bare):
         ctrl = controller(robot)

@@ -94,7 +94,7 @@ def test_a_written_step_becomes_bad_again(poisoned):
 
 def test_what_is_no_dump_or_of_another_task_is_refused(poisoned, tmp_path):
     path = next((poisoned[0] / run_folder.NONFINITE).glob("*.npz"))
-    with pytest.raises(ValueError, match=r"of another task: no .*data"):
+    with pytest.raises(ValueError, match=r"of another task: .*data"):
         faults.load(path, {"data": jax.ShapeDtypeStruct((), float)})
     (tmp_path / "text.npz").write_text("no arrays")
     with pytest.raises(ValueError, match="is no dump"):
