@@ -74,6 +74,17 @@ def test_a_pretrained_policy_loads_by_its_name_and_acts(task, controller):
     assert np.std(action, axis=0).min() > 0.0  # every entry depends on what it sees
 
 
+@pytest.mark.parametrize("task", ["trajectory", "door", "push"])
+def test_a_pretrained_policy_that_sees_spheres_says_so(task):
+    path = policies.find(str(FOLDER / f"{task}-rmp_vices-spheres"))
+    options = load_config(path).task
+    assert (options.env, options.seen_spheres) == (task, 2)
+    env = envs.make(options)
+    agent = load_policy(path).agent(env.observation_size, env.action_size, True)
+    obs = jnp.zeros(env.observation_size)
+    assert agent(obs, jax.random.key(0)).shape == (env.action_size,)
+
+
 def test_a_pretrained_policy_says_what_it_was_measured_to_do():
     """The README's table says 96.2 % success, 2.7 % collisions at the door."""
     found = load_policy(FOLDER / "door-rmp_vices.safetensors").about["evaluation"]
