@@ -96,15 +96,15 @@ def parse(
 
     Exits with code 2 and a message where the flags are wrong.
 
-    Raises:
-        ValueError: A value is empty.
-
     Args:
         kind: The dataclass.
         args: Command line; None: this process's.
         default: What is not given.
         env: Task whose options they are, for the messages.
         quiet: Exit without a message.
+
+    Raises:
+        ValueError: A value is empty.
     """
     given = {} if default is None else {"default": default}
     script = Path(sys.argv[0]).name
