@@ -17,6 +17,7 @@ from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.configurations import (
+    capsule_ends,
     capsule_gaps,
     joint_frames,
     random_configurations,
@@ -231,14 +232,8 @@ def _hand(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _clearance(robot: Robot, q: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Least distances of points (s, 3) from the moving capsules' surfaces, (s,) [m]."""
-    p, R = joint_frames(robot, q)
-    capsules, least = robot.capsules, np.full(len(q), np.inf)
-    for c, k in enumerate(capsules.segment):
-        start, end = np.asarray(capsules.start[c]), np.asarray(capsules.end[c])
-        if k >= 0:
-            start, end = (p[k] + R[k] @ e for e in (start, end))
-        else:
-            start, end = (np.broadcast_to(e, x.shape) for e in (start, end))
-        away = segment_distance(x, x, start, end) - capsules.radius[c]
-        least = np.minimum(least, away)
+    radius, least = robot.capsules.radius, np.full(len(q), np.inf)
+    every = range(len(robot.capsules.segment))
+    for c, (start, end) in capsule_ends(robot, q, every).items():
+        least = np.minimum(least, segment_distance(x, x, start, end) - radius[c])
     return least

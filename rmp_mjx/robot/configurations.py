@@ -48,23 +48,28 @@ def capsule_gaps(
 
     Negative where they overlap.
     """
+    radius, gaps = robot.capsules.radius, np.empty((len(q), len(pairs)))
+    ends = capsule_ends(robot, q, sorted({c for pair in pairs for c in pair}))
+    for i, (a, b) in enumerate(pairs):
+        gaps[:, i] = segment_distance(*ends[a], *ends[b]) - radius[a] - radius[b]
+    return gaps
+
+
+def capsule_ends(
+    robot: Any, q: Float[np.ndarray, "s n"], which: Sequence[int]
+) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """World positions of the ends of some capsules, (s, 3) each [m], by their index."""
     p, R = joint_frames(robot, q)
     capsules = robot.capsules
+    start, end = np.asarray(capsules.start), np.asarray(capsules.end)
+    segment = capsules.segment
 
-    def in_world(points: np.ndarray, c: int) -> np.ndarray:
-        k = capsules.segment[c]
-        if k < 0:
-            return np.broadcast_to(points[c], (len(q), 3))
-        return p[k] + R[k] @ points[c]
+    def in_world(point: np.ndarray, k: int) -> np.ndarray:
+        return np.broadcast_to(point, (len(q), 3)) if k < 0 else p[k] + R[k] @ point
 
-    used = {c for pair in pairs for c in pair}
-    start = {c: in_world(np.asarray(capsules.start), c) for c in used}
-    end = {c: in_world(np.asarray(capsules.end), c) for c in used}
-    gaps = np.empty((len(q), len(pairs)))
-    for i, (a, b) in enumerate(pairs):
-        apart = segment_distance(start[a], end[a], start[b], end[b])
-        gaps[:, i] = apart - capsules.radius[a] - capsules.radius[b]
-    return gaps
+    return {
+        c: (in_world(start[c], segment[c]), in_world(end[c], segment[c])) for c in which
+    }
 
 
 def segment_distance(
