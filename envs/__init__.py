@@ -51,20 +51,25 @@ def make(
 
     Args:
         options: Options of the task.
-        robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
+        robot: An arm object instead of the options' named one. It is taken as it is:
+            its base is the origin, and it starts at its `q_home`.
         controller: A controller object instead of the options' named one.
     """
     return task(options.env)(options, robot, controller)
 
 
 def load(
-    name: str, *, robot: Robot | None = None, controller: Any = None, **options: Any
+    name: str,
+    *,
+    robot: Robot | str | None = None,
+    controller: Any = None,
+    **options: Any,
 ) -> ArmEnv:
     """Make a task by name.
 
     Args:
         name: One of `names()`.
-        robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
+        robot: Name or path of an arm, as the option; or an arm object, as in `make`.
         controller: Name of a controller, or a controller object.
         **options: More of the task's options, as in `make_options`.
 
@@ -73,6 +78,8 @@ def load(
     """
     if isinstance(controller, str):
         options["controller"], controller = controller, None
+    if isinstance(robot, str):
+        options["robot"], robot = robot, None
     return make(make_options(name, **options), robot, controller)
 
 

@@ -14,6 +14,7 @@ from envs import options
 from envs.base import ArmEnv
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, Contacts
+from envs.stands import Box, Place
 from envs.task import View
 from envs.types import Entry, Score
 from rmp_mjx.control import Controller
@@ -107,6 +108,18 @@ class Door(ArmEnv[DoorOptions]):
         self.plate_sizes = np.stack([panel.size, size])
         self.grasp_offset = model.site("door/grasp").pos
         self.sweep = self._sweep()
+
+    @classmethod
+    def places(cls) -> list[Place]:
+        """The handle's arc, with the panel where it is then."""
+        model = mujoco.MjModel.from_xml_path(str(ASSETS / "door.xml"))
+        hinge, panel = model.body("door").pos, model.geom("panel")
+        grasp, found = model.site("grasp").pos, []
+        for angle in np.linspace(0.0, GOAL, 6):
+            R = np.asarray(_opened(angle), float)
+            box = Box(hinge + R @ panel.pos, panel.size, R)
+            found.append(Place(hinge + R @ grasp, box))
+        return found
 
     def objects(self, spec: mujoco.MjSpec) -> Contacts:
         """Hang the door: no part of the arm may touch its panel."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
+from envs.arms import JACO
 from envs.placement import Layout
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.vices import OSC
 from rmp_mjx.fields import check
+from rmp_mjx.robot.library import find
 
 ControllerName = Literal["rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf"]
 
@@ -57,6 +59,8 @@ class Options:
     """Low-level controller that the policy commands: rmp_vices, vices,
     rmp_vices_literal (the paper's formulas with their signs corrected), osc (vices with
     a fixed impedance), or vices_cbf (vices behind a safety filter)."""
+    robot: str = JACO
+    """Arm: a name of rmp_mjx.robots(), or a path of an MJCF, a URDF or a .toml."""
     leaf_weights: bool = False
     """The policy also weighs attractor, posture and standoff of the tree: three more
     entries of an action. For rmp_vices alone."""
@@ -64,7 +68,7 @@ class Options:
     """Physics engine: mujoco (C threads), mjx (JAX), warp (MuJoCo Warp; extra `warp`),
     or auto: mujoco on a CPU, else mjx."""
     armature: Literal["physical", "robosuite"] = "physical"
-    """Rotor inertias of the Jaco 2."""
+    """Rotor inertias of the Jaco 2; any other arm has its own."""
     sim_dt: float = 0.005
     """Physics and control timestep [s]; must divide 0.05 s."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
@@ -123,8 +127,15 @@ class Options:
 
         Raises:
             ValueError: An option has no such value; the message lists the valid ones.
+            RobotError: There is no such arm; likewise.
         """
         check(self)
+        find(self.robot)
+        if self.robot != JACO and self.armature != "physical":
+            raise ValueError(
+                f"armature={self.armature} is for the Jaco 2: leave it out for "
+                f"'{self.robot}', which has rotor inertias of its own"
+            )
         substeps(self.sim_dt)
         if self.leaf_weights and self.controller != "rmp_vices":
             raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import ClassVar
 
 import jax
@@ -16,6 +17,7 @@ from envs.base import ArmEnv
 from envs.placement import CANDIDATES
 from envs.safety import SafetyRecord
 from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
+from envs.stands import Place
 from envs.task import GOAL, Mark
 from envs.types import Entry, Score, State
 from rmp_mjx.math import quat_to_mat
@@ -91,6 +93,14 @@ class Push(ArmEnv[PushOptions]):
     """Slope of the rewards ``1 - tanh(slope d)`` [1/m]."""
     reach = 0.05
     """The block counts as pushed home within this distance of the goal [m]."""
+
+    @classmethod
+    def places(cls) -> list[Place]:
+        """All round where the block starts and may go, beside it and above it."""
+        low, high = BLOCK_LOW[0] - HAND_ROOM, BLOCK_HIGH[0] + HAND_ROOM
+        heights = REST_HEIGHT, REST_HEIGHT + HAND_ROOM
+        corners = itertools.product((low, high), (GOAL_LOW[1], GOAL_HIGH[1]), heights)
+        return [Place(np.array(corner)) for corner in corners]
 
     @property
     def task_entries(self) -> tuple[Entry, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -16,7 +16,7 @@ from rmp_mjx.sim import add_pairs
 ASSETS = Path(__file__).parent / "assets"
 
 TABLE_HEIGHT = -0.112
-"""Height of the table top in the arm's base frame [m]."""
+"""Height of the table top, the Jaco 2's base being at 0 [m]."""
 
 ARM = "arm/"
 """Prefix of the arm's names in a scene."""
@@ -73,6 +73,7 @@ def build_scene(
     sphere_radius: float = 0.05,
     cone: str = "pyramidal",
     objects: Callable[[mujoco.MjSpec], Contacts] = no_objects,
+    mount: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
 ) -> Scene:
     """Compile the arm on its table with the task's objects and obstacle spheres.
 
@@ -88,10 +89,12 @@ def build_scene(
         sphere_radius: Their radius [m].
         cone: Friction cone, `pyramidal` or `elliptic`.
         objects: Adds the task's objects and returns which geoms take part in contact.
+        mount: Where the arm's base stands, (3,) [m].
     """
     spec = mujoco.MjSpec.from_file(str(ASSETS / "arena.xml"))
     spec.option.timestep = sim_dt
     spec.option.cone = int(cone == "elliptic")
+    _put_pedestal(spec, mount)
     arm = robot.mj_spec
     arm.option.timestep = sim_dt  # else attaching warns of a conflict
     spec.attach(arm, prefix=ARM, frame=spec.worldbody.add_frame())
@@ -132,6 +135,18 @@ def build_scene(
         capsule=np.array([capsules.geom.index(g[len(ARM) :]) for g, *_ in world], int),
         other=np.array([int(model.geom(x).id) for *_, x in world], int),
     )
+
+
+def _put_pedestal(spec: mujoco.MjSpec, mount: Sequence[float] | np.ndarray) -> None:
+    """Let the pedestal reach from the table to the arm's base."""
+    if not np.any(mount):
+        return
+    pedestal, height = spec.geom("pedestal"), float(mount[2]) - TABLE_HEIGHT
+    if height < 1e-3:
+        spec.delete(pedestal)
+        return
+    pedestal.size[1] = 0.5 * height
+    pedestal.pos = [mount[0], mount[1], TABLE_HEIGHT + 0.5 * height]
 
 
 def _add_sphere(spec: mujoco.MjSpec, i: int, radius: float) -> str:

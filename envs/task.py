@@ -14,6 +14,7 @@ from envs import sight
 from envs.options import Options as TaskOptions
 from envs.safety import SafetyRecord
 from envs.scene import Contacts, no_objects
+from envs.stands import Place
 from envs.types import ARM_ENTRIES, Entry, Score, State
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
@@ -69,7 +70,8 @@ class Task(abc.ABC, Generic[OptionsT]):
     Options: ClassVar[type[TaskOptions]] = TaskOptions
     """The task's options."""
     q_start: ClassVar[np.ndarray]
-    """Start configuration of the Jaco 2, (7,) [rad]."""
+    """Start configuration of the Jaco 2, (7,) [rad]. The grip of any other arm starts
+    at the same pose."""
     sphere_box: ClassVar[tuple[np.ndarray, np.ndarray]]
     """Corners of the box for the spheres' centres [m]."""
     task_metrics: ClassVar[tuple[Metric, ...]] = ()
@@ -88,6 +90,11 @@ class Task(abc.ABC, Generic[OptionsT]):
     def name(self) -> str:
         """The task's name."""
         return self.options.env
+
+    @classmethod
+    def places(cls) -> Sequence[Place]:
+        """Where an arm's grip must be able to get from the start; arms stand for it."""
+        return ()
 
     @property
     @abc.abstractmethod

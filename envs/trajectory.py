@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from envs import options
 from envs.base import ArmEnv
 from envs.placement import sample_apart
 from envs.safety import SafetyRecord
+from envs.stands import Place
 from envs.task import CURRENT, LATER, REACHED, Mark
 from envs.types import Entry, Score, State
 from rmp_mjx.metric import Metric
@@ -52,6 +54,12 @@ class Trajectory(ArmEnv[TrajectoryOptions]):
     n_points = 4
     reach = 0.05
     """A via point counts as reached within this distance [m]."""
+
+    @classmethod
+    def places(cls) -> list[Place]:
+        """The corners of the via points' box."""
+        corners = itertools.product(*zip(BOX_LOW, BOX_HIGH, strict=True))
+        return [Place(np.array(corner)) for corner in corners]
 
     @property
     def task_entries(self) -> tuple[Entry, ...]:

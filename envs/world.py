@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs import impacts
+from envs.arms import JACO, fit
 from envs.options import CONTROLLERS, substeps
 from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, build_scene
@@ -54,10 +55,12 @@ class World(Task[OptionsT]):
 
         Args:
             options: The task's options.
-            robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
+            robot: An arm object instead of the options' named one. It is taken as it
+                is: its base is the origin, and it starts at its `q_home`.
             controller: A controller object instead of the options' named one.
 
         Raises:
+            RobotError: There is no arm of that name, or it does not fit the task.
             ValueError: There is an observer, and the controller takes no `tau_ext`; or
                 `leaf_weights` is to change a controller object.
         """
@@ -68,7 +71,8 @@ class World(Task[OptionsT]):
             )
         self.options = options
         self._own = {"arm": robot is not None, "controller": controller is not None}
-        self.robot = self._jaco() if robot is None else robot
+        self.mount = np.zeros(3)
+        self.robot = self._named_arm() if robot is None else robot
         self.controller = self._named_controller() if controller is None else controller
         self.scene = build_scene(
             self.robot,
@@ -77,16 +81,20 @@ class World(Task[OptionsT]):
             options.sphere_radius,
             options.cone,
             self.objects,
+            self.mount,
         )
         self.physics = sim.load_physics(options.physics, self.scene.model)
         self.sim_dt = options.sim_dt
         self.n_substeps = substeps(options.sim_dt)
         self.observer = self._named_observer()
 
-    def _jaco(self) -> Robot:
-        """The Jaco 2; its posture leaf rests where the task starts."""
-        robot = Robot.load("jaco2", armature=self.options.armature)
-        return robot.replace(q_home=self.q_start)
+    def _named_arm(self) -> Robot:
+        """The options' arm; its posture leaf rests where the task starts."""
+        if self.options.robot == JACO:
+            robot = Robot.load(JACO, armature=self.options.armature)
+            return robot.replace(q_home=self.q_start)
+        robot, self.mount, start = fit(self.options.robot, type(self))
+        return robot.replace(q_home=start)
 
     def _named_controller(self) -> Controller:
         """The options' controller."""
@@ -128,10 +136,12 @@ class World(Task[OptionsT]):
     def identity(self) -> dict[str, str]:
         """What the options do not say: the arm, and a controller that is an object.
 
-        Runs record it. The Jaco 2 is as in the library: its rotor inertias are an
-        option, and its posture is the task's.
+        Runs record it. A named arm is as it is in all tasks: its posture is the task's,
+        and the rotor inertias of the Jaco 2 are an option.
         """
-        arm = self.robot if self._own["arm"] else Robot.load("jaco2")
+        arm, name = self.robot, self.options.robot
+        if not self._own["arm"]:
+            arm = Robot.load(JACO) if name == JACO else fit(name, type(self)).robot
         found = {"arm": f"'{arm.name}' (fingerprint {arm.fingerprint[:12]})"}
         if self._own["controller"]:
             found["controller"] = f"'{type(self.controller).__name__}' of your own"

@@ -37,6 +37,7 @@ from rmp_mjx.robot.mjcf import (
     remove_gravity_compensation,
 )
 from rmp_mjx.robot.motors import PassiveForces, make_motors, passive_forces
+from rmp_mjx.robot.mounting import add_finger, stand_at
 from rmp_mjx.robot.posture import nominal_posture, search_posture
 from rmp_mjx.types import Constant
 
@@ -213,6 +214,8 @@ class Robot(Pytree):
         *,
         body: str | None = None,
         offset: Numbers = (0.0, 0.0, 0.0),
+        mount: Numbers = (0.0, 0.0, 0.0),
+        finger: float | None = None,
         armature: Numbers | None = None,
         torque_limits: Numbers | None = None,
         velocity_limits: Numbers | None = None,
@@ -234,6 +237,10 @@ class Robot(Pytree):
             links: Bodies that carry control points; default all with geoms.
             body: Body of the end effector, instead of a site.
             offset: End effector's position in that body's frame, (3,) [m].
+            mount: Where the file's origin stands in the world, (3,) [m].
+            finger: Put a rigid finger of 15 cm at the end effector, along its z axis,
+                and move the end effector to its tip, turned about the finger by this
+                angle [rad]. None: no finger.
             armature: Rotor inertias that replace the file's, (n,) [kg m^2].
             torque_limits: Actuator limits that replace the file's, (n,) [N m or N].
             velocity_limits: Limits of the joint speeds, (n,) [rad/s or m/s]; default
@@ -258,6 +265,9 @@ class Robot(Pytree):
         """
         spec = read_spec(path)
         site = end_effector(spec, site, body, offset)
+        stand_at(spec, mount)
+        if finger is not None:
+            site = add_finger(spec, site, finger)
         home = home_configuration(spec)
         joints = lock_other_joints(spec, site, joints)
         remove_gravity_compensation(spec)
