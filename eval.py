@@ -10,11 +10,11 @@ from rich.console import Console
 
 import envs
 from envs import cli
-from rmp_mjx import runtime, sim
+from rmp_mjx import RobotError, runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate, film, report
 from rmp_mjx.training.learning import networks
-from rmp_mjx.training.runs import policies
+from rmp_mjx.training.runs import identity, policies
 from rmp_mjx.training.runs.checkpoint import CheckpointError
 
 
@@ -23,6 +23,9 @@ def agent_of(
 ) -> tuple[int, networks.Agent]:
     """Who acts, and how many iterations of training are behind it."""
     if options.run and config:
+        here, there = options.task.robot, config.task.robot
+        if here != there:
+            console.print(f"trained with the arm '{there}', evaluated with '{here}'")
         return policies.load_agent(
             env,
             config,
@@ -31,6 +34,7 @@ def agent_of(
             console.print,
             options.seed_index,
             options.checkpoint,
+            besides=() if here == there else (identity.ARM,),
         )
     trivial = {"zero": networks.zero_agent, "random": networks.random_agent}
     return 0, trivial[options.agent](env.action_size)
@@ -55,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
         evaluate.check_size(env, options.episodes)
         iterations, agent = agent_of(options, config, env, console)
         options.folder.mkdir(parents=True, exist_ok=True)
-    except (CheckpointError, ConfigError, OSError) as error:
+    except (CheckpointError, ConfigError, RobotError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, CheckpointError) else 2
     key = jax.random.key(options.seed)

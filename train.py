@@ -8,7 +8,7 @@ from rich.console import Console
 
 import envs
 from envs import cli, grid, results
-from rmp_mjx import runtime, sim
+from rmp_mjx import RobotError, runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.runs import distributed, run_folder
@@ -18,6 +18,9 @@ from rmp_mjx.training.runs.saving import Commands
 
 COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.replay")
 """What messages of a run tell its user to type."""
+
+FAILURES = (CheckpointError, TrainingFailure, ConfigError, RobotError, OSError)
+"""What ends a run with a message."""
 
 
 def learn(env, config: TrainConfig, folder, console: Console) -> TrainResult:
@@ -45,11 +48,11 @@ def run(config: TrainConfig, console: Console) -> int:
             complete = result.had_finished and results.are_complete(config, folder)
             if not result.exit_code and not complete:
                 results.finish(env, result, config, folder, console)
-        except (CheckpointError, TrainingFailure, ConfigError, OSError) as error:
+        except FAILURES as error:
             if distributed.is_primary():
                 run_folder.discard(folder)
             print(f"error: {error}", file=sys.stderr)
-            return 2 if isinstance(error, ConfigError) else 1
+            return 2 if isinstance(error, (ConfigError, RobotError)) else 1
         return result.exit_code
 
 

@@ -67,14 +67,30 @@ def fit(name: str, task: Any) -> Fitted:
         RobotError: There is no such arm, or it does not reach what the task asks for.
     """
     asked = need(task)
-    known = tomllib.loads(STORED.read_text()).get(name)
-    if known:
-        stand = Stand(np.array(known["mount"]), known["turn"], np.array(known["q"]))
+    if name in stored():
+        robot, stand = _standing(name)
     else:
         stand = search(Robot.load(name, finger=0.0), [asked])
-    robot = Robot.load(name, mount=stand.mount, finger=stand.turn)
+        robot = Robot.load(name, mount=stand.mount, finger=stand.turn)
     start, q = asked.start, np.asarray(stand.posture)[None]
     q, miss = lead(robot, q, start.p[None], start.R[None])
     if miss[0] > EXACT:
         raise RobotError(f"'{name}' does not reach the start of task '{asked.task}'")
     return Fitted(robot, stand.mount, np.round(q[0], 6))
+
+
+@functools.cache
+def _standing(name: str) -> tuple[Robot, Stand]:
+    """An arm that was placed before."""
+    stand = stored()[name]
+    return Robot.load(name, mount=stand.mount, finger=stand.turn), stand
+
+
+@functools.cache
+def stored() -> dict[str, Stand]:
+    """The arms that were placed before, by name."""
+    found = tomllib.loads(STORED.read_text())
+    return {
+        name: Stand(np.array(arm["mount"]), arm["turn"], np.array(arm["q"]))
+        for name, arm in found.items()
+    }

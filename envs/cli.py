@@ -144,7 +144,7 @@ class EvalOptions(Generic[Task]):
             return Path(self.out)
         if self.run:
             return policies.results_of(Path(self.run))
-        return Path("runs") / f"{self.agent}-{self.task.env}-{self.task.controller}"
+        return Path("runs") / f"{self.agent}-{self.task.title.replace(', ', '-')}"
 
 
 def parse_eval(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from envs.arms import JACO
@@ -172,8 +173,9 @@ class Options:
 
     @property
     def title(self) -> str:
-        """Task and controller, for figures and folder names."""
-        return f"{self.env}, {self.controller}"
+        """Task, controller and arm, for figures and folder names."""
+        arm = "" if self.robot == JACO else f", {Path(self.robot).stem}"
+        return f"{self.env}, {self.controller}{arm}"
 
     @property
     def spheres(self) -> str:

@@ -23,7 +23,7 @@ from rmp_mjx.sim import PhysicsState
 
 BOX_LOW = np.array([0.30, -0.20, 0.03])
 BOX_HIGH = np.array([0.55, 0.20, 0.28])
-"""Corners of the via points' box in the arm's base frame [m]."""
+"""Corners of the via points' box [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Trajectory(ArmEnv[TrajectoryOptions]):
         points = (
             "via points from the grip, the current one first"
             if rotated
-            else "via points in the arm's base frame, in their order"
+            else "via points in the task's frame, in their order"
         )
         return (
             Entry("points", 3 * n, "m", points),

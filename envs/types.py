@@ -29,7 +29,7 @@ class Entry(NamedTuple):
 
 
 ARM_ENTRIES = (
-    Entry("position", 3, "m", "grip site in the arm's base frame"),
+    Entry("position", 3, "m", "grip site in the task's frame"),
     Entry("rotation", 9, "-", "its rotation matrix, row by row"),
     Entry("velocity", 3, "m/s", "its velocity"),
     Entry("angular_velocity", 3, "rad/s", "its angular velocity"),

@@ -7,6 +7,7 @@ from random starts. A policy will not learn what no expert can do.
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from jax import Array
 import envs
 from benchmarks.common import Row, show, write_json
 from envs import door
+from envs.arms import JACO
 from envs.base import ArmEnv
 from envs.types import State
 from rmp_mjx import runtime
@@ -242,17 +244,21 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tasks", nargs="+", default=[c.task for c in CASES])
     parser.add_argument("--controllers", nargs="+", default=DEFAULT)
+    parser.add_argument("--robots", nargs="+", default=[JACO])
     parser.add_argument("--json", type=Path, help="benchmarks/results/experts.json")
     options = parser.parse_args(args)
     runtime.configure()
     rows: list[Row] = []
     for case in CASES:
-        for controller in options.controllers if case.task in options.tasks else ():
-            env = envs.load(case.task, controller=controller, **case.options)
+        wanted = options.controllers if case.task in options.tasks else ()
+        for robot, controller in itertools.product(options.robots, wanted):
+            arm = {"robot": robot, "controller": controller}
+            env = envs.load(case.task, **arm, **case.options)
             metrics = play(env, case.act, options.episodes, case.steps, options.seed)
-            new = summarise(f"{case.name}/{controller}", env.dt, metrics)
+            words = [case.name, controller, *([] if robot == JACO else [robot])]
+            new = summarise("/".join(words), env.dt, metrics)
             rows += new
-            show(new, f"{case.name}, {controller}")
+            show(new, ", ".join(words))
     if options.json:
         write_json(options.json, rows, episodes=options.episodes, seed=options.seed)
 

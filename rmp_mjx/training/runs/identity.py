@@ -6,7 +6,7 @@ it is.
 """
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,22 +48,29 @@ def run_id(config: Path) -> str | None:
     return read_record(config).get(RUN) if config.exists() else None
 
 
-def check(before: Mapping[str, str], env: Any, trained: Any) -> None:
+ARM = "arm"
+"""What an environment's identity calls its arm."""
+
+
+def check(
+    before: Mapping[str, str], env: Any, trained: Any, besides: Sequence[str] = ()
+) -> None:
     """Refuse an environment that is not what something was trained in.
 
     Args:
         before: Identity of the environment that it was trained in.
         env: The environment it is to be used in.
         trained: What was trained: a folder or a file.
+        besides: Things that may be others.
 
     Raises:
         ConfigError: The environment is another one.
     """
     now = of(env)
     for thing, which in before.items():
-        if now.get(thing) != which:
+        if thing not in besides and now.get(thing) != which:
             other = now.get(thing, "the usual one")
             raise ConfigError(
                 f"{trained} was trained with the {thing} {which}, not with {other}: "
-                f"make the environment with that {thing}, from Python"
+                f"make the environment with that {thing}"
             )

@@ -1,6 +1,6 @@
 """Policies of runs: found by name, read from checkpoints or files, written to files."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,7 @@ def load_agent(
     note: Callable[[str], None],
     seed_index: int = 0,
     checkpoint: str = NEWEST,
+    besides: Sequence[str] = (),
 ) -> tuple[int, Agent]:
     """Read the policy of a run, or of a policy file.
 
@@ -64,6 +65,7 @@ def load_agent(
         note: Called with one line for each damaged checkpoint.
         seed_index: Which agent, if the run trained several seeds.
         checkpoint: `newest`, `best`, or a number; a file has one policy.
+        besides: What may differ of the environment's identity, for instance its arm.
 
     Returns:
         Iterations that trained the policy, and the policy.
@@ -75,11 +77,11 @@ def load_agent(
     """
     if not path.is_dir():
         policy = load_policy(path)
-        identity.check(policy.about.get(identity.KEY, {}), env, path)
+        identity.check(policy.about.get(identity.KEY, {}), env, path, besides)
         agent = policy.agent(env.observation_size, env.action_size, deterministic)
         return policy.about["iterations"], agent
     own = path / run_folder.CONFIG
-    identity.check(identity.saved(own), env, path)
+    identity.check(identity.saved(own), env, path, besides)
     ppo = make_ppo(env, config.ppo)
     whole = seeds.shapes(ppo, config.ppo)
     learner = whole.learner.replace(value=None, policy_opt=None, value_opt=None)
