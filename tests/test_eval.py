@@ -55,6 +55,19 @@ def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):
     assert json.loads((folder / "eval.json").read_text()) == found
 
 
+def test_a_policy_goes_to_another_arm_that_is_named(evaluate, asked, tmp_path, capsys):
+    folder = tmp_path / "run"
+    run(folder)
+    options = ["--run", str(folder), "--episodes", "9", "--no-video"]
+    assert evaluate([*options, "--robot", "ur5e"]) == 0
+    assert asked[-1].robot == "ur5e"
+    said = capsys.readouterr().out
+    assert "trained with the arm 'jaco2', evaluated with 'ur5e'" in said
+    assert "counter, rmp_vices, ur5e" in said
+    with pytest.raises(SystemExit, match="2"):
+        evaluate([*options, "--robot", "urfive"])
+
+
 def test_a_policy_file_is_evaluated_as_its_run_into_a_folder_of_its_name(
     evaluate, tmp_path, monkeypatch, capsys
 ):

@@ -44,7 +44,7 @@ def test_a_redundant_arm_stays_near_where_it_rests():
     q = robot.q_home[None] + 0.0
     p, R = hand_pose(robot, q)
     other, _ = reach(robot, q, p, R, steps=100, rest=q + 0.3)
-    assert np.abs(other - q).max() > 0.1  # it moves within its null space
+    assert np.abs(other - q).max() > 0.05  # it moves within its null space
     np.testing.assert_allclose(hand_pose(robot, other)[0], p, atol=1e-3)
     back, _ = reach(robot, other, p, R, steps=300, rest=q)
     np.testing.assert_allclose(back, q, atol=0.02)

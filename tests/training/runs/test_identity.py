@@ -70,3 +70,11 @@ def test_the_same_arm_is_taken(run):
 def test_a_run_that_recorded_no_arm_goes_with_any(run, tmp_path):
     identity.check({}, Armed(), tmp_path)
     assert identity.saved(tmp_path / run_folder.CONFIG) == {}
+
+
+def test_a_policy_may_go_to_another_arm_if_that_is_wanted(run):
+    folder, config = run
+    other = Armed(arm="jaco2")
+    besides = (identity.ARM,)
+    found = load_agent(other, config, folder, True, pytest.fail, besides=besides)
+    assert found[0] == load_agent(Armed(), config, folder, True, pytest.fail)[0]
