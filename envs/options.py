@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from envs.placement import Layout
+from envs.randomisation import Randomisation
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.vices import OSC
@@ -44,7 +45,7 @@ _AT_LEAST_ZERO = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Randomisation):
     """Options of every task; a task adds its own in a subclass.
 
     They are flags of the command line, too: an option that takes one of a few names is
@@ -125,6 +126,7 @@ class Options:
             ValueError: An option has no such value; the message lists the valid ones.
         """
         check(self)
+        super().__post_init__()
         substeps(self.sim_dt)
         if self.leaf_weights and self.controller != "rmp_vices":
             raise ValueError(
