@@ -41,7 +41,11 @@ def make_options(env: str, **options: Any) -> Options:
     for name in options:
         if name not in valid:
             raise ValueError(unknown(f"option of '{env}'", name, valid))
-    return kind(**options)
+    values: dict[str, Any] = {  # JSON gives back lists for tuples
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in options.items()
+    }
+    return kind(**values)
 
 
 def make(

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from envs import sight
 from envs.options import CTRL_DT
 from envs.placement import place_spheres
+from envs.randomisation import draw_model
 from envs.safety import SafetyRecord
 from envs.spheres import AWAY, LEVEL, Course, Spheres, draw_count, draw_speed
 from envs.task import OptionsT
@@ -107,9 +108,10 @@ class ArmEnv(World[OptionsT]):
             spheres: Their state.
             course: The curriculum.
         """
+        key_motors, key_model = (jax.random.fold_in(rng, i) for i in (1, 2))
         data = self.physics.init(
             jnp.concatenate([q, objects]), jnp.zeros(self.scene.model.nv), centers
-        )
+        ).replace(model=draw_model(key_model, self.options, self.scene.model))
         return State(
             data=data,
             obs=self._observation(data, self.site(data), task, spheres, rng),
@@ -120,7 +122,7 @@ class ArmEnv(World[OptionsT]):
                 "rng": rng,
                 "step": jnp.zeros((), jnp.int32),
                 "spheres": spheres,
-                "control": self.remember(q),
+                "control": self.remember(q, key_motors),
                 "active_events": SafetyRecord.empty().events,
                 "task": task,
             }

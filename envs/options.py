@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 from envs.arms import JACO
 from envs.placement import Layout
+from envs.randomisation import Randomisation
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.vices import OSC
@@ -47,7 +48,7 @@ _AT_LEAST_ZERO = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Randomisation):
     """Options of every task; a task adds its own in a subclass.
 
     They are flags of the command line, too: an option that takes one of a few names is
@@ -131,6 +132,7 @@ class Options:
             RobotError: There is no such arm; likewise.
         """
         check(self)
+        super().__post_init__()
         find(self.robot)
         if self.robot != JACO and self.armature != "physical":
             raise ValueError(

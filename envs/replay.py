@@ -9,6 +9,7 @@ limit.
 from __future__ import annotations
 
 import argparse
+import copy
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -91,24 +92,27 @@ def policy_step(
         centers = data.mocap_pos
         if options.obstacle_speed and env.scene.spheres:
             centers, spheres = spheres.move(centers, env.sim_dt, *env.sphere_box)
-        return out, centers, spheres, memory
+        return out, memory.acting(out.tau), centers, spheres, memory
 
-    model, simulated = env.scene.model, mujoco.MjData(env.scene.model)
+    model = copy.copy(env.scene.model)
+    for name, value in data.model.items():
+        getattr(model, name)[:] = value
+    simulated = mujoco.MjData(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     for k in range(env.n_substeps):
-        wrong = None if noise is None else noise[k]
-        out, centers, spheres, memory = control(data, spheres, memory, wrong)
+        wrong = None if noise is None else jax.tree.map(lambda x, k=k: x[k], noise)
+        out, acting, centers, spheres, memory = control(data, spheres, memory, wrong)
         parts = {
             "root force": np.asarray(out.f),
             "root metric": np.asarray(out.M),
             "desired acceleration": np.asarray(out.qdd),
-            "torque": np.asarray(out.tau),
+            "torque": np.asarray(acting),
         }
         yield Moment(f"controller, physics step {k + 1}", parts)
         simulated.qpos[:], simulated.qvel[:] = data.qpos, data.qvel
         simulated.qacc_warmstart[:] = data.warmstart
         simulated.mocap_pos[:] = centers
-        simulated.ctrl[:] = out.tau
+        simulated.ctrl[:] = acting
         mujoco.mj_step(model, simulated)
         data = data.replace(
             qpos=jnp.asarray(simulated.qpos, data.qpos.dtype),

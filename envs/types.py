@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from envs import safety
+from envs.randomisation import Motors
 from rmp_mjx.control.observer import ContactMemory
 from rmp_mjx.metric import SUCCESS, Metric, of_fields
 from rmp_mjx.pytree import Pytree
@@ -45,6 +46,16 @@ class ControlMemory(Pytree):
     tau: Float[Array, " n"] | None
     """Torque of the last control step [N m]; None for an arm without a limit on its
     rate."""
+    motors: Motors | None = None
+    """What becomes of the commanded torques; None if they act as they are."""
+
+    def acting(self, tau: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The torque that acts after this control step [N m].
+
+        Args:
+            tau: What the controller commands, (n,) [N m].
+        """
+        return tau if self.motors is None else self.motors.torque
 
 
 class State(Pytree):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from envs import impacts
 from envs.arms import JACO, fit
 from envs.options import CONTROLLERS, substeps
+from envs.randomisation import draw_motors
 from envs.safety import Motion, SafetyRecord, Torques, observe
 from envs.scene import TABLE_HEIGHT, build_scene
 from envs.spheres import Spheres
@@ -28,6 +29,7 @@ from rmp_mjx.control import (
 )
 from rmp_mjx.control.observer import ContactObserver
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import (
@@ -40,6 +42,17 @@ from rmp_mjx.shapes import Gap
 from rmp_mjx.sim import PhysicsState
 from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.vec import Vec
+
+
+class Noise(Pytree):
+    """Errors of what is measured."""
+
+    observer: Float[Array, "*k n"]
+    """Of the joint velocities that the observer gets, its own [rad/s]."""
+    position: Float[Array, "*k n"]
+    """Of the joint positions that controller and observer get [rad]."""
+    velocity: Float[Array, "*k n"]
+    """Of the joint velocities that both get [rad/s]."""
 
 
 class World(Task[OptionsT]):
@@ -173,17 +186,19 @@ class World(Task[OptionsT]):
         radius, delay = self.options.sphere_radius, self.options.obstacle_delay
         return spheres.perceive(slots, data.mocap_pos, radius, error, delay)
 
-    def remember(self, q: Float[Array, " n"]) -> ControlMemory:
+    def remember(self, q: Float[Array, " n"], rng: Array) -> ControlMemory:
         """What is known of the control before an episode: the arm is held at rest.
 
         Args:
             q: Joint positions, (n,) [rad].
+            rng: Randomness of the motors.
         """
         contact = None if self.observer is None else self.observer.start(self.robot.n)
-        if self.robot.tau_rate_max is None:
-            return ControlMemory(contact, None)
         arm = arm_state(self.robot, q, jnp.zeros_like(q))
-        return ControlMemory(contact, self._applied(dynamics(self.robot, arm)[1]))
+        hold = self._applied(dynamics(self.robot, arm)[1])
+        motors = draw_motors(rng, self.options, hold, self.sim_dt)
+        limited = self.robot.tau_rate_max is not None
+        return ControlMemory(contact, hold if limited else None, motors)
 
     def control(
         self,
@@ -192,7 +207,7 @@ class World(Task[OptionsT]):
         setpoint: Any,
         memory: ControlMemory,
         error: Array | float = 0.0,
-        noise: Array | None = None,
+        noise: Noise | None = None,
     ) -> tuple[ControlOutput, ControlMemory]:
         """One control step: the controller, with what an arm can measure of contacts.
 
@@ -202,16 +217,18 @@ class World(Task[OptionsT]):
             setpoint: Target, from the controller's `setpoint`.
             memory: From `remember`, or from the last control step.
             error: Error of the spheres' measured positions, (k, 3) [m].
-            noise: Error of the joint velocities that the observer gets, (n,) [rad/s];
-                None: no error.
+            noise: Errors of what is measured; None: none.
 
         Returns:
             The controller's output, and the memory for the next step.
         """
         n, felt, contact = self.robot.n, {}, memory.contact
         q, qd = data.qpos[:n], data.qvel[:n]
+        measured = qd
+        if noise is not None:
+            q, qd = q + noise.position, qd + noise.velocity
+            measured = qd + noise.observer
         if self.observer is not None and contact is not None:
-            measured = qd if noise is None else qd + noise
             felt["tau_ext"], contact = self.observer.estimate(
                 contact, measured, self.sim_dt
             )
@@ -222,7 +239,9 @@ class World(Task[OptionsT]):
         tau = self._applied(out.tau)
         if contact is not None:
             contact = contact.then(out.Mq, out.bias, tau)
-        return out, ControlMemory(contact, None if memory.tau is None else tau)
+        last = None if memory.tau is None else tau
+        motors = None if memory.motors is None else memory.motors.then(out.tau)
+        return out, ControlMemory(contact, last, motors)
 
     def _applied(self, tau: Float[Array, " n"]) -> Float[Array, " n"]:
         """Torques as the motors give them, within their ranges [N m]."""
@@ -248,7 +267,7 @@ class World(Task[OptionsT]):
             memory: From `remember`, or from the last policy step.
             error: Error of the spheres' measured positions, (k, 3) [m].
             time: Time of the policy step [s].
-            key: Randomness of what the observer measures; None: no noise.
+            key: Randomness of what is measured; None: no noise.
 
         Returns:
             Physics, spheres and memory afterwards, the set-point that was held, and
@@ -267,7 +286,7 @@ class World(Task[OptionsT]):
                     data.mocap_pos, self.sim_dt, *self.sphere_box
                 )
                 data = data.replace(mocap_pos=centers)
-            before, data = data, self.physics.step(data, out.tau)
+            before, data = data, self.physics.step(data, memory.acting(out.tau))
             touching = impacts.touching(self.scene, data)
             now = observe(
                 self.scene,
@@ -305,12 +324,24 @@ class World(Task[OptionsT]):
         )
         return data, spheres, memory, setpoint, record
 
-    def noise(self, key: Array | None) -> Array | None:
-        """Errors of the observer's velocities in a policy step, (steps, n) [rad/s]."""
-        if key is None or self.observer is None:
+    def noise(self, key: Array | None) -> Noise | None:
+        """Errors of what is measured in a policy step, each (steps, n).
+
+        Args:
+            key: Randomness; None: no noise.
+        """
+        names = "observer_noise", "position_noise", "velocity_noise"
+        deviations = [getattr(self.options, name) for name in names]
+        if key is None or not any(deviations):
             return None
-        drawn = jax.random.normal(key, (self.n_substeps, self.robot.n))
-        return self.options.observer_noise * drawn
+        keys = key, *(jax.random.fold_in(key, i) for i in (1, 2))
+        shape = (self.n_substeps, self.robot.n)
+        return Noise(
+            *(
+                deviation * jax.random.normal(own, shape)
+                for deviation, own in zip(deviations, keys, strict=True)
+            )
+        )
 
     def site(self, data: PhysicsState) -> SiteState:
         """Pose and velocity of the grip site."""

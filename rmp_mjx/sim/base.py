@@ -8,6 +8,7 @@ from typing import Protocol
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from rmp_mjx.pytree import Pytree
@@ -43,6 +44,8 @@ class PhysicsState(Pytree):
     """World positions of the moving obstacles (mocap bodies) [m]."""
     sensors: Float[Array, " s"]
     """Contact sensors of the last step."""
+    model: dict[str, Array] = struct.field(default_factory=dict)
+    """Fields of the model that this simulation has instead of the engine's own."""
 
 
 class Contacts(Pytree):
@@ -64,7 +67,12 @@ class Physics(Protocol):
     def init(
         self, qpos: Array, qvel: Array, mocap_pos: Array | None = None
     ) -> PhysicsState:
-        """State at rest in the given pose, nothing simulated yet."""
+        """State at rest in the given pose, nothing simulated yet.
+
+        `PhysicsState.replace(model=...)` gives it other values in fields of the model.
+        What MuJoCo derives from them when it compiles a model stays as it is: the
+        weights of constraints, `*_invweight0`.
+        """
         ...
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:

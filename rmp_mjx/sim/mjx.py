@@ -63,7 +63,7 @@ class MjxPhysics:
             mocap_pos=state.mocap_pos,
             ctrl=ctrl,
         )
-        data = mjx.step(self._mjx_model, data)
+        data = mjx.step(self._mjx_model.replace(**state.model), data)
         return jax.tree.map(
             lambda new, old: new.astype(old.dtype),
             PhysicsState(
@@ -72,6 +72,7 @@ class MjxPhysics:
                 warmstart=data.qacc_warmstart,
                 mocap_pos=data.mocap_pos,
                 sensors=self._sensors(data),
+                model=state.model,
             ),
             state,
         )

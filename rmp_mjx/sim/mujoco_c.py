@@ -27,7 +27,7 @@ class MujocoPhysics:
     def __init__(self, model: mujoco.MjModel):
         """Keep the model; batches are made when they are first needed."""
         self.model = model
-        self._idle: dict[tuple[int, int], list[_Batch]] = {}
+        self._idle: dict[tuple[int, int, tuple[str, ...]], list[_Batch]] = {}
 
     def init(
         self, qpos: Array, qvel: Array, mocap_pos: Array | None = None
@@ -50,9 +50,10 @@ class MujocoPhysics:
             jnp.where(good, x, jnp.asarray(instead, x.dtype))
             for x, instead in zip(given, harmless, strict=True)
         ]
+        given += state.model.values()
         results = (state.qpos, state.qvel, state.warmstart, state.sensors)
         shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in results)
-        step = functools.partial(self._step_host, _threads())
+        step = functools.partial(self._step_host, _threads(), tuple(state.model))
         moved = jax.lax.platform_dependent(
             *given,
             cpu=functools.partial(_in_place, step, shapes),
@@ -61,13 +62,13 @@ class MujocoPhysics:
         qpos, qvel, warmstart, sensors = (jnp.where(good, x, jnp.nan) for x in moved)
         return state.replace(qpos=qpos, qvel=qvel, warmstart=warmstart, sensors=sensors)
 
-    def _step_host(self, threads, out, given):
+    def _step_host(self, threads, fields, out, given):
         size = int(np.prod(given[0].shape[:-1], dtype=int))
-        idle = self._idle.setdefault((size, threads), [])
+        idle = self._idle.setdefault((size, threads, fields), [])
         try:
             batch = idle.pop()  # one step of a list: no two callers get the same
         except IndexError:
-            batch = _Batch(self.model, size, threads)
+            batch = _Batch(self.model, size, threads, fields)
         batch.step(out, given)
         idle.append(batch)
 
@@ -75,11 +76,14 @@ class MujocoPhysics:
 class _Batch:
     """Simulations, and the arrays in which the engine keeps their states."""
 
-    def __init__(self, model: mujoco.MjModel, size: int, threads: int):
+    def __init__(
+        self, model: mujoco.MjModel, size: int, threads: int, fields: tuple[str, ...]
+    ):
         self.batch = mujoco.batch.Batch(model, size, threads)
         bind = self.batch.bind
         moving = [bind(name) for name in ("qpos", "qvel", "qacc_warmstart")]
         self.given = [*moving, bind("mocap_pos"), bind("ctrl")]
+        self.given += [self.batch.expand(name) for name in fields]
         self.out = [*moving, bind("sensordata")]
         self.time = bind("time")
 

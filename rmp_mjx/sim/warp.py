@@ -58,7 +58,16 @@ class WarpPhysics:
         return init_state(self.model, qpos, qvel, mocap_pos)
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
-        """Advance by one timestep."""
+        """Advance by one timestep.
+
+        Raises:
+            PhysicsError: The state has fields of the model of its own.
+        """
+        if state.model:
+            raise PhysicsError(
+                f"physics 'warp' has one model for all: {', '.join(state.model)} "
+                "cannot differ; choose mujoco or mjx"
+            )
         one = jax.tree.map(lambda x: x[None], (state, ctrl))
         return jax.tree.map(lambda x: x[0], self._step_worlds(*one))
 

@@ -28,8 +28,19 @@ def start(jaco, size):
     engine = load_physics("mujoco", jaco.scene.model)
     q, mocap = jnp.asarray(jaco.q), jnp.asarray(jaco.mocap)
     state = jax.vmap(engine.init)(q, jnp.zeros_like(q), mocap)
+    state = state.replace(model=models(jaco.scene.model))
     lanes = np.arange(size) % 4
     return jax.tree.map(lambda x: x[lanes], state)
+
+
+def models(model):
+    """Each motion's own masses and friction; only the free motion's differ."""
+    light, damped = np.ones((4, model.nbody)), np.zeros((4, model.nv))
+    light[0], damped[0] = 0.95, 2.0
+    return {
+        "body_mass": jnp.asarray(light * model.body_mass, jnp.float32),
+        "dof_damping": jnp.asarray(damped + model.dof_damping, jnp.float32),
+    }
 
 
 @pytest.fixture(scope="module")

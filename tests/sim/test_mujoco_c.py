@@ -75,6 +75,34 @@ def test_in_single_precision_it_is_the_loop_with_a_rounded_state_bit_for_bit(
     assert largest_difference(engine, step, jaco, reference, np.float32) == 0.0
 
 
+def test_each_simulation_has_its_own_values_of_the_model_bit_for_bit(
+    engine, jaco, reference
+):
+    factor = np.array([0.5, 1.0, 1.5, 2.0])
+    own = {
+        name: factor.reshape(-1, *[1] * value.ndim) * value
+        for name in ("body_mass", "dof_armature", "body_inertia", "pair_friction")
+        for value in [getattr(jaco.scene.model, name)]
+    }
+    loops = []
+    for lane, (q, mocap) in enumerate(zip(jaco.q, jaco.mocap, strict=True)):
+        model = copy.copy(jaco.scene.model)
+        for name, values in own.items():
+            getattr(model, name)[:] = values[lane]
+        loops.append(reference(model, q, mocap))
+    with jax.enable_x64(True):
+        step = jax.jit(jax.vmap(engine.step))
+        state = start(engine, jaco, np.float64)
+        state = state.replace(model={k: jnp.asarray(v) for k, v in own.items()})
+        for k in range(50):
+            state = step(state, jnp.asarray(jaco.torque(k)))
+            for lane, loop in enumerate(loops):
+                loop.step(jaco.torque(k)[lane])
+        found = np.asarray(state.qpos)
+    np.testing.assert_array_equal(found, [loop.data.qpos for loop in loops])
+    assert np.ptp(found[:1] - jaco.q[0]) > 1e-3  # half the mass: the arm rises
+
+
 def test_rounding_the_state_to_float32_hardly_moves_the_arm(
     engine, step, jaco, reference
 ):
