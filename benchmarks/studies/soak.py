@@ -1,7 +1,7 @@
 """Hours of hostile actions in every task: does anything grow, stop, or turn to NaN?
 
 Run as ``python -m benchmarks.soak --minutes 15 --json FILE``; exit code 1 if a state
-was not finite. Every entry of every action is -1 or 1 by chance, among spheres that move.
+was not finite. Every entry of an action is -1 or 1 by chance, among moving spheres.
 """
 
 from __future__ import annotations
