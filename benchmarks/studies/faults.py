@@ -217,9 +217,11 @@ def attack(
     """Give a batch to a compiled controller, plain and with faults in 3 of 4 states.
 
     Returns:
-        The number of `unusable` states, and of those where something is wrong: outputs
-        `not_finite`; torques `over` the limits; a `flag` that is not what it should be,
-        or `solved` where it is 0; torques that `changed` though no input in use did.
+        The number of `unusable` states; of those `unsolved`, unusable though each input
+        could be used, which happens at the bounds alone; and of those where something
+        is wrong: outputs `not_finite`; torques `over` the limits; a `flag` that is not
+        what it should be, or `solved` where it is 0; torques that `changed` though no
+        input in use did.
     """
     fields = sampler.draw(rng, batch)
     hostile = {name: x.copy() for name, x in fields.items()}
@@ -234,15 +236,15 @@ def attack(
     flag, solved = (found.get(k, 0.0 * good) > 0.0 for k in ("usable", "solved"))
     same = ~lanes | (fault is unused)
     limit = sampler.robot.tau_max.astype(np.float32)
+    unsolved = good & ~close & ~flag & (fault is at_the_bounds)
     wrong = {
         "not_finite": ~np.all(finite, axis=0),
         "over": np.any(np.abs(out.tau) > limit, axis=1),
-        "flag": ((flag != good) & ~close) | (solved & ~flag),
+        "flag": ((flag != good) & ~close & ~unsolved) | (solved & ~flag),
         "changed": same & np.any(plain.tau != out.tau, axis=1),
     }
-    return {"unusable": int(np.sum(~flag))} | {
-        k: int(x.sum()) for k, x in wrong.items()
-    }
+    counts = {"unusable": ~flag, "unsolved": unsolved} | wrong
+    return {k: int(x.sum()) for k, x in counts.items()}
 
 
 def compiled(ctrl: ImpedanceController, **options: Any) -> Callable[..., Any]:
@@ -277,7 +279,7 @@ def main() -> None:
             note = ", ".join(
                 f"{k} {n}" for k, n in ({"states": states} | total).items()
             )
-            wrong = sum(total.values()) - total["unusable"]
+            wrong = sum(n for k, n in total.items() if not k.startswith("un"))
             rows.append(Row(f"{arm}_{name}", wrong, "wrong states", note))
             print(rows[-1], flush=True)
         jax.clear_caches()
