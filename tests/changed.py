@@ -14,14 +14,14 @@ OTHERS = {
     "control/relaxation": "control/test_controller control/test_tree_equivalence",
     "control/rmp_vices": "control/test_tree_equivalence control/test_controller",
     "control/tree": "control/test_tree_equivalence",
-    "robot/configurations": "robot/test_posture robot/test_bounds",
     "robot/errors": "robot/test_model robot/test_mjcf",
     "robot/fingerprint": "robot/test_model",
     "robot/limits": "robot/test_model",
     "robot/links": "robot/test_model robot/test_mjcf",
-    "robot/point_state": "robot/test_control_points robot/test_bounds",
+    "robot/mjcf": "robot/test_mjcf robot/test_model",
+    "robot/point_state": "robot/test_bounds control/test_tree_equivalence",
 }
-"""Tests of the modules without a test file of their own name."""
+"""Tests of the modules without a test file of their own name, or with more than it."""
 
 
 def mirrors(module: str) -> list[str]:

@@ -176,7 +176,8 @@ class ImpedanceController(Pytree, abc.ABC):
     ) -> ControlOutput:
         """What is sent of an output: itself without a guard.
 
-        The guard would replace a torque that is not finite; the fail-safe has to see it.
+        The guard would replace a torque that is not finite, and the fail-safe has to
+        see it.
         """
         if self.guard is None:
             return out
