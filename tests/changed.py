@@ -9,6 +9,8 @@ from pathlib import Path
 
 OTHERS = {
     "rmp/leaf": "rmp/test_leaves",
+    "rmp/leaves/barrier": "rmp/test_leaves control/test_contact",
+    "rmp/leaves/joint_limit": "rmp/test_leaves control/test_contact",
     "control/leaves": "control/test_tree_equivalence control/test_pytree",
     "control/literal": "control/test_controller rmp/test_leaves",
     "control/relaxation": "control/test_controller control/test_tree_equivalence",
@@ -18,6 +20,7 @@ OTHERS = {
     "robot/fingerprint": "robot/test_model",
     "robot/limits": "robot/test_model",
     "robot/links": "robot/test_model robot/test_mjcf",
+    "robot/model": "robot/test_model robot/test_dynamics",
     "robot/mjcf": "robot/test_mjcf robot/test_model",
     "robot/point_state": "robot/test_bounds control/test_tree_equivalence",
 }
