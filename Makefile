@@ -2,8 +2,8 @@
 #   make train    set up if needed, then run the main job (ARGS="--seed 1" adds options)
 #   make test     set up if needed, then run the tests
 #   make paper    set up if needed, then run the paper's experiments (PRESET=smoke)
-# The rest: lint type format faults bench bench-peers bench-gate docs wheel sbom audit
-#   test-latest clean.
+# The rest: lint type format faults mutants bench bench-peers bench-gate docs wheel sbom
+#   audit test-latest clean.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -28,8 +28,8 @@ LATEST_STAMP := $(LATEST)/.installed
 TOOLS := build/tools
 PIP := -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help setup train paper test test-slow test-latest faults lint format type bench \
-  bench-peers bench-gate docs wheel sbom audit clean
+.PHONY: help setup train paper test test-slow test-latest faults mutants lint format \
+  type bench bench-peers bench-gate docs wheel sbom audit clean
 
 help:
 	@sed -n '1,6s/^#  *//p' Makefile
@@ -60,6 +60,11 @@ test-slow: $(STAMP)
 # Hostile input in numbers; prints the figures of docs/reliability.md.
 faults: $(STAMP)
 	$(PY) -m pytest -m faults $(ARGS)
+
+# Do the tests see small changes of the code? A random sample of them: half an hour for
+# --sample 60. Goes on where it was interrupted.
+mutants: $(STAMP) $(TOOLS)
+	$(PY) -m benchmarks.mutants $(ARGS)
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
@@ -115,7 +120,7 @@ audit: $(TOOLS)
 
 $(TOOLS): $(STAMP)
 	$(PY) -m venv $@
-	$@/bin/python $(PIP) cyclonedx-bom pip-audit pip-licenses
+	$@/bin/python $(PIP) cosmic-ray cyclonedx-bom pip-audit pip-licenses
 
 # Python 3.12 and the newest release of everything.
 test-latest:

@@ -12,6 +12,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from rmp_mjx.math import LOOSE
+
 Test = Callable[[np.ndarray], Any]
 """From numbers to whether they are good, for all at once or one by one."""
 
@@ -59,7 +61,7 @@ def directions(x: np.ndarray) -> np.ndarray:
 
 def rotations(R: np.ndarray) -> np.ndarray:
     """Which matrices (..., 3, 3) are rotations, up to rounding in any precision."""
-    square = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) <= 0.05
+    square = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) <= LOOSE
     return np.all(square, axis=(-1, -2)) & (np.linalg.det(R) > 0.0)
 
 

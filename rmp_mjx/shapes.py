@@ -84,19 +84,24 @@ class Shape(Pytree, abc.ABC):
         return jnp.asarray(self.active)[:, None] & ~exempt
 
 
-class Turning(Shape):
-    """Rounded bodies that may turn."""
+class Rounded(Shape):
+    """Bodies with a centre and a radius."""
 
     center: Float[Constant, "o 3"]
     """Centre, world frame [m]."""
     radius: Float[Constant, " o"]
     """Radius of the rounding [m]; it comes on top of the core."""
-    angular_velocity: Float[Constant, "o 3"]
-    """Angular velocity, world frame [rad/s]."""
 
     def sound(self) -> Bool[Array, " o"]:
         """Which slots hold numbers that mean an obstacle, (o,)."""
         return super().sound() & (self.radius >= 0.0)
+
+
+class Turning(Rounded):
+    """Rounded bodies that may turn."""
+
+    angular_velocity: Float[Constant, "o 3"]
+    """Angular velocity, world frame [rad/s]."""
 
     def _ride_along(self, x: Vec, v: Vec) -> tuple[Vec, Vec, Vec]:
         """Position, velocity and Coriolis acceleration in the moving frame."""
@@ -108,17 +113,8 @@ class Turning(Shape):
         return r, rdot - swept, coriolis
 
 
-class Spheres(Shape):
-    """Balls."""
-
-    center: Float[Constant, "o 3"]
-    """Centre, world frame [m]."""
-    radius: Float[Constant, " o"]
-    """Radius [m]."""
-
-    def sound(self) -> Bool[Array, " o"]:
-        """Which slots hold numbers that mean an obstacle, (o,)."""
-        return super().sound() & (self.radius >= 0.0)
+class Spheres(Rounded):
+    """Balls: the core is a point."""
 
     def gap(
         self, x: Vec, v: Vec, rho: Float[Constant, "1 p"], hand: Bool[np.ndarray, " p"]

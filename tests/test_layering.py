@@ -22,7 +22,7 @@ LAW = {
     "fields": {"names"},
     "names": set(),
     "pytree": set(),
-    "refuse": set(),
+    "refuse": {"math"},
     "trees": set(),
     "xla": set(),
     "files": set(),

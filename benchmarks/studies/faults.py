@@ -22,9 +22,11 @@ from rmp_mjx import runtime
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.control.vices import OSC
+from rmp_mjx.robot.library import SHIPPED
 
 WORST = (np.nan, np.inf, -np.inf, 3e38, -3e38)
 LARGEST, LOOSE, LATEST = 1e4, 0.05, 1e9
+SMALLEST = np.finfo(np.float32).tiny  # what is smaller is zero in a compiled program
 FRAMES = ("R_des", "rotation", "normal", "axis")
 SIGNLESS = ("kp_pos", "kp_ori", "radius", "half_length", "half_size")
 SIGNLESS += ("attractor", "posture", "standoff")
@@ -176,6 +178,9 @@ FAULTS: dict[str, Callable[..., None]] = {
 }
 """Families of states: what is written into those of a batch that a mask names."""
 
+EXTREME = (FAULTS["any_size"], at_the_bounds)
+"""Families with numbers up to the bounds, where float32 may find no solution."""
+
 
 def usable(fields: Fields) -> tuple[np.ndarray, np.ndarray]:
     """Which states can be used by docs/fail_safe.md, and which are close to a bound."""
@@ -184,6 +189,7 @@ def usable(fields: Fields) -> tuple[np.ndarray, np.ndarray]:
     for name in _numbers(fields):
         x, slots = fields[name].astype(float), name.startswith("obstacles")
         x = x.reshape(*x.shape[: 1 + slots], -1)
+        x[np.abs(x) < SMALLEST] = 0.0
         fine = np.all(np.abs(x) <= (LATEST if _last(name) == "time" else LARGEST), -1)
         if _last(name) in SIGNLESS:
             fine &= np.all(x >= 0.0, axis=-1)
@@ -214,9 +220,11 @@ def attack(
     """Give a batch to a compiled controller, plain and with faults in 3 of 4 states.
 
     Returns:
-        The number of `unusable` states, and of those where something is wrong: outputs
-        `not_finite`; torques `over` the limits; a `flag` that is not what it should be,
-        or `solved` where it is 0; torques that `changed` though no input in use did.
+        The number of `unusable` states; of those `unsolved`, unusable though each input
+        could be used, which only the families in `EXTREME` excuse; and of those where
+        something is wrong: outputs `not_finite`; torques `over` the limits; a `flag`
+        that is not what it should be, or `solved` where it is 0; torques that `changed`
+        though no input in use did.
     """
     fields = sampler.draw(rng, batch)
     hostile = {name: x.copy() for name, x in fields.items()}
@@ -231,15 +239,15 @@ def attack(
     flag, solved = (found.get(k, 0.0 * good) > 0.0 for k in ("usable", "solved"))
     same = ~lanes | (fault is unused)
     limit = sampler.robot.tau_max.astype(np.float32)
+    unsolved = good & ~close & ~flag & (fault in EXTREME)
     wrong = {
         "not_finite": ~np.all(finite, axis=0),
         "over": np.any(np.abs(out.tau) > limit, axis=1),
-        "flag": ((flag != good) & ~close) | (solved & ~flag),
+        "flag": ((flag != good) & ~close & ~unsolved) | (solved & ~flag),
         "changed": same & np.any(plain.tau != out.tau, axis=1),
     }
-    return {"unusable": int(np.sum(~flag))} | {
-        k: int(x.sum()) for k, x in wrong.items()
-    }
+    counts = {"unusable": ~flag, "unsolved": unsolved} | wrong
+    return {k: int(x.sum()) for k, x in counts.items()}
 
 
 def compiled(ctrl: ImpedanceController, **options: Any) -> Callable[..., Any]:
@@ -247,18 +255,27 @@ def compiled(ctrl: ImpedanceController, **options: Any) -> Callable[..., Any]:
     return jax.jit(jax.vmap(lambda given: ctrl(**given)), **options)
 
 
+def arms(seed: int) -> dict[str, rmp.Robot]:
+    """Every arm that ships, and a random one."""
+    shipped = {name: rmp.Robot.load(name) for name in SHIPPED}
+    return shipped | {"random": random_arm(seed)}
+
+
 def main() -> None:
-    """Attack every controller of two arms, print, and write the requested file."""
+    """Attack every controller of every arm, print, and write the requested file."""
     parser = argparse.ArgumentParser(description="Hostile states.")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few states")
     parser.add_argument("--seed", type=int, default=0, help="of the states and one arm")
+    parser.add_argument(
+        "--arm", action="append", choices=(*SHIPPED, "random"), help="only this arm"
+    )
     args = parser.parse_args()
     runtime.configure()
-    batch, batches = (256, 1) if args.quick else (2048, 10)
-    rng, rows = np.random.default_rng(args.seed), []
-    arms = {"jaco2": rmp.Robot.load("jaco2"), "random": random_arm(args.seed)}
-    for arm, robot in arms.items():
+    batch, batches, rows = *((256, 1) if args.quick else (2048, 9)), []
+    made = arms(args.seed)
+    for arm in args.arm or made:
+        robot, rng = made[arm], np.random.default_rng(args.seed)
         sampler = Sampler(robot)
         for name, ctrl in controllers(robot).items():
             run, total, states = compiled(ctrl), dict[str, int](), 0
@@ -269,9 +286,10 @@ def main() -> None:
             note = ", ".join(
                 f"{k} {n}" for k, n in ({"states": states} | total).items()
             )
-            wrong = sum(total.values()) - total["unusable"]
+            wrong = sum(n for k, n in total.items() if not k.startswith("un"))
             rows.append(Row(f"{arm}_{name}", wrong, "wrong states", note))
             print(rows[-1], flush=True)
+        jax.clear_caches()
     show(rows, "Hostile states")
     if args.json:
         write_json(args.json, rows, batch=batch, batches=batches, seed=args.seed)

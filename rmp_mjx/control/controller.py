@@ -174,7 +174,11 @@ class ImpedanceController(Pytree, abc.ABC):
         obstacles: Obstacles,
         tau_ext: Float[Array, " n"] | None,
     ) -> ControlOutput:
-        """What is sent of an output: itself without a guard."""
+        """What is sent of an output: itself without a guard.
+
+        The guard would replace a torque that is not finite, and the fail-safe has to
+        see it.
+        """
         if self.guard is None:
             return out
         tau, found = self.guard(
@@ -182,7 +186,7 @@ class ImpedanceController(Pytree, abc.ABC):
         )
         changed = psd_solve(out.Mq, tau - out.bias)
         return out.replace(
-            tau=tau,
+            tau=jnp.where(jnp.isfinite(out.tau), tau, out.tau),
             qdd=jnp.where(found["guard_used"] > 0.0, changed, out.qdd),
             diagnostics=out.diagnostics | found,
         )

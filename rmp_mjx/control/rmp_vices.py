@@ -186,6 +186,7 @@ class RMPVICES(ImpedanceController):
         tau = jnp.matmul(Mq, qdd, precision="highest") + bias
         held = found["torque_limit"]
         tau = jnp.where(held > 0.0, high, jnp.where(held < 0.0, low, tau))
+        tau = jnp.where(jnp.isfinite(qdd), tau, jnp.nan)  # for the fail-safe to see
         tau, found["torque_limit"] = clip_torque(tau, low, high)
         return RootSolution(qdd, tau, found)
 

@@ -10,9 +10,13 @@ from rmp_mjx.names import unknown
 SEEDS = 2**32
 """Seeds have 32 bits: JAX would take a larger one for another."""
 
-
 MOST = 2**30
 """The largest size: JAX counts with 32 bits, and some counts are sums of two."""
+
+MOST_PASSES = 1000
+"""Most passes over an iteration's data; PPO makes 3 to 80. An iteration with many more
+would seem to hang."""
+
 LOG_STD_LIMIT = 20.0
 """Magnitude of an initial log standard deviation: actions are within [-1, 1]."""
 
@@ -149,8 +153,9 @@ class PPOConfig:
                 raise ConfigError(
                     f"{name} must lie in [0, 1], is {getattr(self, name)}"
                 )
-        sizes = "num_envs num_seeds unroll_length num_groups num_updates_per_batch"
-        _at_most(MOST, self, *sizes.split(), "num_minibatches")
+        sizes = "num_envs num_seeds unroll_length num_groups num_minibatches"
+        _at_most(MOST, self, *sizes.split())
+        _at_most(MOST_PASSES, self, "num_updates_per_batch")
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             raise ConfigError(f"hidden_sizes must be positive, is {self.hidden_sizes}")
         _at_most(MOST, self, "hidden_sizes")

@@ -34,8 +34,9 @@ def test_joint_limits_add_it_on_the_side_that_contacts_press_to():
     for q, push in ((0.85, 5.0), (-0.85, -5.0)):
         x, rest = jnp.array([q]), jnp.zeros(1)
         f, m = leaf.scalar(x, rest)
-        pressed, _ = leaf.scalar_against(x, rest, jnp.array([push]))
+        pressed, same = leaf.scalar_against(x, rest, jnp.array([push]))
         freed, _ = leaf.scalar_against(x, rest, jnp.array([-push]))
+        np.testing.assert_array_equal(m, same)
         np.testing.assert_allclose(pressed - f, -m * push, rtol=1e-5)
         np.testing.assert_allclose(freed, f, atol=1e-6 * np.abs(f).max())
     other = RMPflowJointLimit(np.array([-1.0]), np.array([1.0]))

@@ -57,6 +57,7 @@ def test_hostile_states_get_torques_within_the_limits_and_a_right_flag(
         found = faults.attack(lambda x: run(name, x), sampler, fault, rng, BATCH)
         everywhere = family in ("plausible", "at_the_bounds", "unused")
         assert (found.pop("unusable") == 0) == everywhere
+        assert found.pop("unsolved") == 0
         assert not any(found.values()), (family, found)
 
 

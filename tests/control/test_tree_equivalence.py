@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from benchmarks.common import AutodiffRMPVICES
-from rmp_mjx import RMPVICES, Leaves, Node, Siblings, WeightedActionRange, per_link
+from rmp_mjx import (
+    RMPVICES,
+    Leaves,
+    Node,
+    Siblings,
+    TaskMap,
+    WeightedActionRange,
+    per_link,
+)
 from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
@@ -17,6 +25,16 @@ from rmp_mjx.robot.kinematics import arm_state, point_positions, site_state
 from tests.control.conftest import QUICK
 
 quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
+
+
+class Definition(AutodiffRMPVICES):
+    """The tree behind a closed form whose results are spoilt: it takes none of them."""
+
+    def unguarded(self, *args):
+        """What the closed form gives, and wrong."""
+        out = super().unguarded(*args)
+        f, M, qdd = out.f + 1.0, out.M + 1.0, out.qdd + 1.0
+        return out.replace(f=f, M=M, qdd=qdd, tau=0.5 * out.tau)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +67,7 @@ def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, varied):
     """
     leaves = Leaves.default(robot).with_collision(varied)
     fast = run64(RMPVICES(robot, leaves), *inputs)
-    slow = run64(AutodiffRMPVICES(robot, leaves), *inputs)
+    slow = run64(Definition(robot, leaves), *inputs)
     assert np.quantile(fast.diagnostics["clearance"], [0.1, 0.9]).tolist() < [0.0, 0.2]
     weight = fast.diagnostics["orientation_weight"]
     assert weight.max() > 50 * weight.min()
@@ -65,7 +83,7 @@ def test_closed_form_is_the_autodiff_tree_in_contact(run64, robot, inputs, push)
     rng = np.random.default_rng(1)
     tau_ext = push * rng.normal(size=(len(inputs[0]), 7)) * robot.tau_max / 30.5
     fast = run64(RMPVICES(robot), *inputs, tau_ext)
-    slow = run64(AutodiffRMPVICES(robot), *inputs, tau_ext)
+    slow = run64(Definition(robot), *inputs, tau_ext)
     alone = run64(RMPVICES(robot), *inputs)
     for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("qdd", 1e-7), ("tau", 1e-7)):
         a, b, c = (
@@ -75,6 +93,22 @@ def test_closed_form_is_the_autodiff_tree_in_contact(run64, robot, inputs, push)
         scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
         assert np.max(np.abs(a - b) / scale) < tolerance, name
         assert np.max(np.abs(a - c) / scale) > 1e-3, name
+
+
+def test_the_closed_form_evaluates_no_task_map(monkeypatch, ctrl, robot, inputs):
+    """So the tests above compare two programs, not one with itself."""
+
+    def refuse(*args):
+        raise AssertionError("a task map is evaluated")
+
+    monkeypatch.setattr(TaskMap, "_at", refuse)
+    q, qd, action, obstacles = jax.tree.map(lambda x: x[0], inputs)
+    setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
+    args = q, qd, setpoint, obstacles
+    with jax.enable_x64(True):
+        jax.eval_shape(ctrl, *args)
+        with pytest.raises(AssertionError, match="a task map is evaluated"):
+            jax.eval_shape(Definition(robot), *args)
 
 
 def with_weights(inputs, entries):
@@ -97,7 +131,7 @@ def test_a_policys_weights_are_those_of_the_autodiff_tree(
     entries = np.random.default_rng(5).uniform(-1.0, 1.0, (len(inputs[0]), 3))
     args = with_weights(inputs, entries)
     fast = run64(weighted.replace(leaves=leaves), *args)
-    kind = AutodiffRMPVICES(robot, leaves, action_range=WeightedActionRange())
+    kind = Definition(robot, leaves, action_range=WeightedActionRange())
     slow = run64(kind, *args)
     for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("tau", 1e-7)):
         a, b = (getattr(out, name).reshape(len(inputs[0]), -1) for out in (fast, slow))

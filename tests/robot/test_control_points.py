@@ -42,6 +42,17 @@ def test_about_64_points_cover_every_moving_link(robot):
     assert set(robot.points.segment) == set(range(7))
 
 
+def test_the_hand_is_what_the_last_joint_moves(robot):
+    """Of an arm with a single joint that is all of it."""
+    np.testing.assert_array_equal(
+        robot.points.hand, [k == 6 for k in robot.points.segment]
+    )
+    one = """<mujoco><worldbody><body><joint name="a" range="-1 1"/>
+    <geom name="one" type="capsule" size=".05 .1"/><site name="tip"/></body></worldbody>
+    <actuator><motor joint="a" ctrlrange="-5 5"/></actuator></mujoco>"""
+    assert Robot.from_mjcf(one, site="tip").points.hand.all()
+
+
 def test_no_gap_between_neighbours_is_wider_than_the_spacing(robot):
     """Along each capsule, ends included: so their union covers it."""
     for c, k in enumerate(robot.capsules.segment):

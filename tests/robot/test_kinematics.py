@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rmp_mjx.robot.kinematics import site_pose
+from rmp_mjx.robot.kinematics import point_positions, site_pose
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,15 @@ def test_control_points_move_as_mujoco_moves_their_bodies(robot, states, ours_at
             np.testing.assert_allclose(x[k, i], point, rtol=0.0, atol=1e-12)
             np.testing.assert_allclose(v[k, i], J @ data.qvel, rtol=0.0, atol=1e-11)
             np.testing.assert_allclose(a[k, i], Jdot @ data.qvel, rtol=0.0, atol=1e-10)
+
+
+def test_points_are_where_their_motion_says(robot, states, ours_at):
+    """`point_positions` of 5 states: 1e-12 m, rounding of another sum."""
+    _, _, (x, _, _) = ours_at
+    with jax.enable_x64(True):
+        for k in range(5):
+            alone = point_positions(robot, jnp.asarray(states[0][k]))
+            np.testing.assert_allclose(alone, x[k], rtol=0.0, atol=1e-12)
 
 
 def test_pose_keeps_the_precision_it_is_called_in(robot):

@@ -51,12 +51,13 @@ def scene(bodies, rest=""):
     <actuator>{motors}</actuator>{rest}</mujoco>"""
 
 
-def test_the_site_picks_one_of_two_arms():
+@pytest.mark.parametrize(("one", "other"), [("right", "left"), ("left", "right")])
+def test_the_site_picks_one_of_two_arms(one, other):
     """The other one stands still in the way: its capsules are of the fixed base."""
-    robot = Robot.from_mjcf(scene(arm("left", 0.2) + arm("right", -0.2)), "right_tip")
-    assert robot.joint_names == ("right1", "right2")
+    robot = Robot.from_mjcf(scene(arm("left", 0.2) + arm("right", -0.2)), f"{one}_tip")
+    assert robot.joint_names == (f"{one}1", f"{one}2")
     segments = dict(zip(robot.capsules.geom, robot.capsules.segment, strict=True))
-    assert segments["right_fore"] == 1 and segments["left_fore"] == -1
+    assert segments[f"{one}_fore"] == 1 and segments[f"{other}_fore"] == -1
 
 
 def test_a_mimic_joint_on_the_chain_is_named_and_fingers_are_not():

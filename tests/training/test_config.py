@@ -49,6 +49,10 @@ CONFIG = TrainConfig(Task())
         ({"num_envs": True}, "num_envs must be a whole number, is True"),
         ({"num_envs": 10**20}, "num_envs has more than 64 bits"),
         ({"num_envs": 2**31}, "num_envs must be at most"),
+        (
+            {"num_updates_per_batch": 1001},
+            "num_updates_per_batch must be at most 1,000",
+        ),
         ({"hidden_sizes": (4, "x")}, "hidden_sizes must be a whole number"),
         ({"hidden_sizes": "64"}, "hidden_sizes must be several values"),
         ({"seed": -1}, "seed must not be negative"),

@@ -9,11 +9,12 @@ import pytest
 from brax.training import types
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses
+from scipy import stats
 
 from rmp_mjx.training.learning import value_scale
 from rmp_mjx.training.learning.advantages import generalised_advantages
 from rmp_mjx.training.learning.loss import Batch, ppo_loss
-from rmp_mjx.training.learning.networks import make_networks
+from rmp_mjx.training.learning.networks import distribution, make_networks
 from rmp_mjx.training.learning.rollout import Transition
 
 T, B, OBS, ACT = 4, 6, 3, 2
@@ -110,6 +111,42 @@ def test_loss_and_gradient_are_those_of_brax(problem):
     np.testing.assert_allclose(value, brax_value, rtol=1e-5)
     for a, b in zip(jax.tree.leaves(grad), jax.tree.leaves(brax_grad), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_the_kl_is_that_of_two_gaussians_from_the_acting_policy_to_the_new(problem):
+    """By their formula, within five standard errors of 20,000 actions.
+
+    Of another sign, or from the new policy to the acting one, it is 50 errors away.
+    """
+    networks, normalizer, params, _, _ = problem
+    rng, size = np.random.default_rng(0), 20_000
+    obs = jnp.ones((size, OBS))
+    logits = networks.policy_network.apply(normalizer, params[0], obs[:1])
+    new = distribution(networks, logits)
+    mean, scale = np.asarray(new.loc, float), np.asarray(new.scale, float)
+    old_mean, old_scale = mean + 0.5 * scale, 1.3 * scale
+    raw = old_mean + old_scale * rng.normal(size=(size, ACT))
+    old, now = (
+        stats.norm.logpdf(raw, *of).sum(1)
+        for of in ((old_mean, old_scale), (mean, scale))
+    )
+    batch = Batch(
+        obs=obs,
+        raw_action=jnp.asarray(raw, jnp.float32),
+        log_prob=jnp.asarray(old, jnp.float32),
+        advantage=jnp.zeros(size),
+        target=jnp.zeros(size),
+        weight=jnp.ones(size),
+    )
+    _, parts = ppo_loss(params, normalizer, batch, networks, 0.2, 0.1, 1.0)
+    exact = ACT * (-np.log(1.3) + (1.3**2 + 0.5**2) / 2.0 - 0.5)
+    error = np.std(np.expm1(now - old) - (now - old)) / np.sqrt(size)
+    assert abs(parts["kl"] - exact) < 5.0 * error < 0.1 * exact
+    outside = np.abs(np.expm1(now - old)) > 0.2
+    # float32: some of the 20,000 may be on the other side of the bound
+    assert abs(parts["clip_fraction"] - outside.mean()) < 1e-3
+    entropy = ACT * (0.5 + 0.5 * np.log(2.0 * np.pi)) + np.log(scale).sum()
+    np.testing.assert_allclose(parts["entropy"], entropy, rtol=1e-5)  # float32
 
 
 def test_a_transition_of_weight_zero_has_no_influence(problem):
