@@ -8,8 +8,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-import envs
-from envs import cli
+from envs import cli, registry
 from rmp_mjx import runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate, film, report
@@ -51,7 +50,7 @@ def main(args: Sequence[str] | None = None) -> int:
         console.print(f"trained with other software: {', '.join(newer)}")
     runtime.configure(split_cpu=True)
     try:
-        env, *others = [envs.make(task) for task in options.tasks]
+        env, *others = [registry.make(task) for task in options.tasks]
         evaluate.check_size(env, options.episodes)
         iterations, agent = agent_of(options, config, env, console)
         options.folder.mkdir(parents=True, exist_ok=True)

@@ -6,8 +6,7 @@ from functools import partial
 
 from rich.console import Console
 
-import envs
-from envs import cli, grid, results
+from envs import cli, grid, registry, results
 from rmp_mjx import runtime, sim
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
@@ -39,7 +38,7 @@ def run(config: TrainConfig, console: Console) -> int:
     with lock:
         runtime.configure(split_cpu=distributed.alone())
         try:
-            env = envs.make(config.task)
+            env = registry.make(config.task)
             evaluate.check_size(env, config.run.eval_episodes)
             result = learn(env, config, folder, console)
             complete = result.had_finished and results.are_complete(config, folder)

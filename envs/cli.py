@@ -7,8 +7,13 @@ from typing import Any, Generic, Literal
 
 import tyro
 
-import envs
-from envs.flags import (
+from rmp_mjx.fields import check
+from rmp_mjx.training.config import MOST, SEEDS, ConfigError, TrainConfig
+from rmp_mjx.training.runs import policies
+from rmp_mjx.training.runs.checkpoint import NEWEST
+
+from . import registry
+from .flags import (
     DEFAULT,
     EnvName,
     Task,
@@ -19,12 +24,8 @@ from envs.flags import (
     parse,
     train_flags,
 )
-from envs.grid import GRID, Grid, load_grid, open_grid
-from envs.options import Options
-from rmp_mjx.fields import check
-from rmp_mjx.training.config import MOST, SEEDS, ConfigError, TrainConfig
-from rmp_mjx.training.runs import policies
-from rmp_mjx.training.runs.checkpoint import NEWEST
+from .grid import GRID, Grid, load_grid, open_grid
+from .options import Options
 
 
 def make_config(env: str = DEFAULT, **options: Any) -> TrainConfig:
@@ -37,7 +38,7 @@ def make_config(env: str = DEFAULT, **options: Any) -> TrainConfig:
     Raises:
         ValueError: Unknown task, option or value; the message lists the valid ones.
     """
-    return TrainConfig(envs.make_options(env)).replace(**options)
+    return TrainConfig(registry.make_options(env)).replace(**options)
 
 
 def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid | None]:
@@ -163,7 +164,7 @@ def parse_eval(
     path = policies.find(given["run"]) if given["run"] else None
     config = load_config(path) if path else None
     env = given["env"] or (config.task.env if config else DEFAULT)
-    task = envs.make_options(env)
+    task = registry.make_options(env)
     if config and config.task.env == env:
         task = config.task
     elif config:

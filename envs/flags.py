@@ -13,20 +13,21 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-import envs
-from envs.options import Options
 from rmp_mjx.fields import arguments, check
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.policy import is_policy, load_policy
 from rmp_mjx.training.records import config_of, read_record
 from rmp_mjx.training.runs.run_folder import CONFIG
 
+from . import registry
+from .options import Options
+
 DEFAULT = "trajectory"
 """Task where none is named."""
 
 Task = TypeVar("Task", bound=Options)
 Parsed = TypeVar("Parsed")
-EnvName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(envs.names()) + "}")]
+EnvName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(registry.names()) + "}")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +77,7 @@ def train_flags(
     quiet: bool = False,
 ) -> TrainOptions:
     """Parse the flags of a training run; what is not given is as it was saved."""
-    kind = envs.task(env).Options
+    kind = registry.task(env).Options
     config = saved or TrainConfig(kind())
     run = dataclasses.replace(
         config.run, resume=None, run_dir=None, overwrite=False, allow_changes=False
@@ -155,7 +156,7 @@ def from_record(record: Mapping[str, Any]) -> TrainConfig[Options]:
     """
     try:
         if "ppo" in record:
-            return config_of(record, lambda task: envs.make_options(**task))
+            return config_of(record, lambda task: registry.make_options(**task))
         return train_flags(record["env"], _flags(record), quiet=True).config
     except SystemExit as error:
         raise ConfigError("no configuration of this version, nor of 0.1") from error

@@ -10,10 +10,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-import envs
 import train
 from benchmarks.paper import __main__ as paper
-from envs import cli, export, replay
+from envs import cli, export, registry, replay
 from envs.flags import Processes, TrainOptions
 from rmp_mjx.report import __main__ as report
 from rmp_mjx.training.config import PPOConfig, RunConfig
@@ -110,7 +109,7 @@ def places(tmp_path, monkeypatch):
     arm_tasks.register(monkeypatch)
     toy = toys.Counter()
     stopped = TrainResult(lambda obs, key: obs, 1, 130, False)
-    monkeypatch.setattr(envs, "make", lambda *given: toy)
+    monkeypatch.setattr(registry, "make", lambda *given: toy)
     monkeypatch.setattr(train, "learn", lambda *given: stopped)
     monkeypatch.setattr(paper.training, "run", lambda *given: 1)
 
