@@ -9,4 +9,9 @@ from .registry import make as make
 from .registry import make_options as make_options
 from .registry import names as names
 from .registry import task as task
+from .scene import Contacts as Contacts
+from .task import Mark as Mark
+from .task import View as View
+from .types import Entry as Entry
+from .types import Score as Score
 from .types import State as State

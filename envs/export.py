@@ -36,6 +36,8 @@ class ExportOptions:
     training's episodes), or an iteration's number."""
     seed_index: int = 0
     """Which agent of a run that trained several seeds, from 0."""
+    env: str | None = None
+    """The run's task, if it is a module:Class."""
 
 
 def export(options: ExportOptions, note: Callable[[str], None]) -> None:
@@ -57,6 +59,8 @@ def export(options: ExportOptions, note: Callable[[str], None]) -> None:
         raise ConfigError(f"{file} exists already: delete it, or name another file")
     if not file.parent.is_dir():
         raise ConfigError(f"{file}: there is no folder {file.parent}")
+    if options.env:
+        registry.task(options.env)
     config = load_config(run)
     if not 0 <= k < config.ppo.num_seeds:
         raise ConfigError(f"seed_index must lie in 0 .. {config.ppo.num_seeds - 1}")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from rmp_mjx.names import unknown
 from rmp_mjx.robot import Robot
 
+from . import outside
 from .base import ArmEnv
 from .door import Door
 from .options import Options
@@ -17,11 +19,11 @@ from .trajectory import Trajectory
 ENVS: dict[str, type[ArmEnv]] = {
     task.Options.env: task for task in (Trajectory, Door, Push)
 }
-"""Tasks by name."""
+"""The tasks of this package by name."""
 
 
 def names() -> tuple[str, ...]:
-    """The tasks that `load` knows."""
+    """The tasks that come with this package."""
     return tuple(ENVS)
 
 
@@ -29,7 +31,7 @@ def make_options(env: str, **options: Any) -> Options:
     """The options of a task, checked; builds nothing.
 
     Args:
-        env: One of `names()`.
+        env: Name of a task, as in `task`.
         **options: Fields of the task's options, for instance `controller`, `physics`,
             `obstacles`; see `envs.options.Options` and the task's module.
 
@@ -42,6 +44,17 @@ def make_options(env: str, **options: Any) -> Options:
         if name not in valid:
             raise ValueError(unknown(f"option of '{env}'", name, valid))
     return kind(**options)
+
+
+def recorded(record: Mapping[str, Any]) -> Options:
+    """The options of a task from their record in a file.
+
+    Raises:
+        ValueError: As in `make_options`, or the task is a `module:Class` that nobody
+            has named in this process: files make it import nothing.
+    """
+    outside.check_recorded(record["env"])
+    return make_options(**record)
 
 
 def make(
@@ -63,7 +76,7 @@ def load(
     """Make a task by name.
 
     Args:
-        name: One of `names()`.
+        name: Name of a task, as in `task`.
         robot: An arm of your own instead of the Jaco 2; it starts at its `q_home`.
         controller: Name of a controller, or a controller object.
         **options: More of the task's options, as in `make_options`.
@@ -79,12 +92,15 @@ def load(
 def task(name: str) -> type[ArmEnv]:
     """The class of a task.
 
+    Args:
+        name: One of `names()`, a task of an installed package by its name, or a class
+            of your own as `module:Class`, which is imported; see `docs/add_a_task.md`.
+
     Raises:
-        ValueError: Unknown task; the message lists the valid ones.
+        ValueError: Unknown task, or one that cannot be used; the message lists the
+            valid ones, or says what is wrong.
     """
-    if name not in ENVS:
-        raise ValueError(unknown("env", name, names()))
-    return ENVS[name]
+    return ENVS[name] if name in ENVS else outside.find(name, names())
 
 
 def describe(name: str, **options: Any) -> str:

@@ -190,11 +190,14 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--limit", type=float, default=VALUE_LIMIT, help="greatest good magnitude"
     )
+    parser.add_argument("--env", help="the run's task, if it is a module:Class")
     say = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
     try:
         options = parser.parse_args(arguments(args))
         if not options.limit > 0:
             raise ValueError(f"limit must be positive, is {options.limit}")
+        if options.env:
+            registry.task(options.env)
         runtime.configure()
         env, state, action, about = read(choose(options.dump))
     except (ValueError, OSError) as error:
