@@ -1,7 +1,6 @@
 """Hostile command lines: each ends in one sentence and leaves nothing behind."""
 
 import dataclasses
-import importlib
 import json
 import random
 import sys
@@ -10,9 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-import train
 from benchmarks.paper import __main__ as paper
-from envs import cli, export, registry, replay
+from envs import cli, export, registry, replay, train
+from envs import eval as evaluate
 from envs.flags import Processes, TrainOptions
 from rmp_mjx.report import __main__ as report
 from rmp_mjx.training.config import PPOConfig, RunConfig
@@ -22,7 +21,6 @@ from rmp_mjx.training.runs.loop import TrainResult
 from tests.envs import arm_tasks
 from tests.training import toys
 
-evaluate = importlib.import_module("eval")
 COMMANDS = {
     "train": train.main,
     "eval": evaluate.main,

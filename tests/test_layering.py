@@ -39,6 +39,7 @@ LAW = {
     "check_robot": BASE
     | {"rmp", "shapes", "obstacles", "robot", "control", "sim", "runtime", "files"},
     "report": {"fields", "files", "training"},
+    "commands": {"check_robot"},
     "rmp_mjx": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
 }
 # The rooms inside `training`, each with those that it may import.
@@ -52,11 +53,14 @@ TRAINING = {
     "evaluation": {"config", "stats", "learning", "policy", "runs"},
     "brax": {"config", "learning", "policy", "runs"},
 }
-TOP_LEVEL = {"envs", "train", "eval", "benchmarks", "tests"}
+TOP_LEVEL = {"envs", "rmp_mjx_envs", "train", "eval", "benchmarks", "tests"}
+CONSOLE = {("rmp_mjx.commands", "rmp_mjx_envs")}
+"""The one import against the law: a console command starts a task."""
 KNOW_MUJOCO = {"robot", "sim", "check_robot"}
 # where tasks and training meet
 COMMAND_LINE = {
-    f"envs.{name}" for name in ("cli", "export", "flags", "grid", "replay", "results")
+    f"envs.{name}"
+    for name in ["cli", "eval", "export", "flags", "grid", "replay", "results", "train"]
 }
 
 
@@ -135,7 +139,8 @@ def test_a_room_imports_only_the_rooms_below_it(path):
     assert here in LAW, f"new room {here!r}: give it a place in the import law"
     for name in imports(path):
         head = name.split(".")[0]
-        assert head not in TOP_LEVEL, f"{dotted(path)} imports {name}"
+        if (dotted(path), name) not in CONSOLE:
+            assert head not in TOP_LEVEL, f"{dotted(path)} imports {name}"
         if head == "mujoco":
             assert here in KNOW_MUJOCO, f"{dotted(path)} imports {name}"
         if head == "rmp_mjx" and here != room(name) and room(name) in LAW:
