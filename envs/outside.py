@@ -12,6 +12,7 @@ import importlib
 import inspect
 import sys
 import traceback
+import types
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -166,7 +167,10 @@ def _called(name: str, kind: type[ArmEnv]) -> type[ArmEnv]:
         frozen=True,
         namespace={"env": name, **_same(options)},
     )
-    return type(kind)(kind.__name__, (kind,), {"Options": named, **_same(kind)})
+    same = {"Options": named, **_same(kind)}
+    return types.new_class(
+        kind.__name__, (kind,), exec_body=lambda own: own.update(same)
+    )
 
 
 def _same(kind: type) -> dict[str, str | None]:

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ def source(root):
 
 def test_the_task_of_the_documents_is_short_and_steps(source):
     assert len(source.splitlines()) < 60
-    names = {"__name__": "__main__"}
+    names: dict[str, Any] = {"__name__": "__main__"}
     exec(compile(source, "my_task.py", "exec"), names)
     env = names["Reach"](names["ReachOptions"](physics="mujoco"))
     state = jax.eval_shape(env.reset, jax.random.key(0))
