@@ -1,80 +1,8 @@
 """Train a policy: `python train.py --env trajectory --controller rmp_vices`."""
 
 import sys
-from collections.abc import Sequence
-from functools import partial
 
-from rich.console import Console
-
-import envs
-from envs import cli, grid, results
-from rmp_mjx import RobotError, runtime, sim
-from rmp_mjx.training.config import ConfigError, TrainConfig
-from rmp_mjx.training.evaluation import evaluate
-from rmp_mjx.training.runs import distributed, run_folder
-from rmp_mjx.training.runs.checkpoint import CheckpointError
-from rmp_mjx.training.runs.loop import TrainingFailure, TrainResult, train
-from rmp_mjx.training.runs.saving import Commands
-
-COMMANDS = Commands(resume="python train.py --resume", replay="python -m envs.replay")
-"""What messages of a run tell its user to type."""
-
-FAILURES = (CheckpointError, TrainingFailure, ConfigError, RobotError, OSError)
-"""What ends a run with a message."""
-
-
-def learn(env, config: TrainConfig, folder, console: Console) -> TrainResult:
-    """Train with the trainer that the configuration names."""
-    if config.trainer == "ours":
-        return train(env, config, folder, console, COMMANDS)
-    from rmp_mjx.training.brax import trainer  # loads all of Brax's environments
-
-    return trainer.train(env, config, folder, console)
-
-
-def run(config: TrainConfig, console: Console) -> int:
-    """Train and evaluate one configuration; returns the exit code."""
-    try:
-        folder, lock = distributed.open_run(config)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    with lock:
-        runtime.configure(split_cpu=distributed.alone())
-        try:
-            env = envs.make(config.task)
-            evaluate.check_size(env, config.run.eval_episodes)
-            result = learn(env, config, folder, console)
-            complete = result.had_finished and results.are_complete(config, folder)
-            if not result.exit_code and not complete:
-                results.finish(env, result, config, folder, console)
-        except FAILURES as error:
-            if distributed.is_primary():
-                run_folder.discard(folder)
-            print(f"error: {error}", file=sys.stderr)
-            return 2 if isinstance(error, (ConfigError, RobotError)) else 1
-        return result.exit_code
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Parse, check, train, evaluate; returns the exit code."""
-    console = Console()
-    try:
-        options, wanted = cli.parse_train(args)
-        configs = list(wanted.cells().values()) if wanted else [options.config]
-        for config in configs:
-            sim.require(config.task.physics)
-        distributed.join(**vars(options.processes))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    if not distributed.alone():
-        runtime.configure()
-        console = Console(quiet=not distributed.is_primary())
-    if wanted:
-        return grid.run(wanted, partial(run, console=console), console)
-    return run(configs[0], console)
-
+from envs.train import main
 
 if __name__ == "__main__":
     sys.exit(main())

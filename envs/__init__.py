@@ -1,113 +1,20 @@
 """Batched manipulation tasks. `load` makes one by name."""
 
-from __future__ import annotations
+from .base import ArmEnv as ArmEnv
+from .options import Options as Options
+from .scene import Contacts as Contacts
+from .task import Mark as Mark
+from .task import View as View
+from .types import Entry as Entry
+from .types import Score as Score
+from .types import State as State
 
-import dataclasses
-from typing import Any
-
-from envs.base import ArmEnv as ArmEnv
-from envs.door import Door
-from envs.options import Options as Options
-from envs.push import Push
-from envs.trajectory import Trajectory
-from envs.types import State as State
-from rmp_mjx.names import unknown
-from rmp_mjx.robot import Robot
-
-ENVS: dict[str, type[ArmEnv]] = {
-    task.Options.env: task for task in (Trajectory, Door, Push)
-}
-"""Tasks by name."""
-
-
-def names() -> tuple[str, ...]:
-    """The tasks that `load` knows."""
-    return tuple(ENVS)
-
-
-def make_options(env: str, **options: Any) -> Options:
-    """The options of a task, checked; builds nothing.
-
-    Args:
-        env: One of `names()`.
-        **options: Fields of the task's options, for instance `controller`, `physics`,
-            `obstacles`; see `envs.options.Options` and the task's module.
-
-    Raises:
-        ValueError: Unknown task, option, or value; the message lists the valid ones.
-    """
-    kind = task(env).Options
-    valid = [field.name for field in dataclasses.fields(kind)]
-    for name in options:
-        if name not in valid:
-            raise ValueError(unknown(f"option of '{env}'", name, valid))
-    values: dict[str, Any] = {  # JSON gives back lists for tuples
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in options.items()
-    }
-    return kind(**values)
-
-
-def make(
-    options: Options, robot: Robot | None = None, controller: Any = None
-) -> ArmEnv:
-    """Make the task that the options describe.
-
-    Args:
-        options: Options of the task.
-        robot: An arm object instead of the options' named one. It is taken as it is:
-            its base is the origin, and it starts at its `q_home`.
-        controller: A controller object instead of the options' named one.
-    """
-    return task(options.env)(options, robot, controller)
-
-
-def load(
-    name: str,
-    *,
-    robot: Robot | str | None = None,
-    controller: Any = None,
-    **options: Any,
-) -> ArmEnv:
-    """Make a task by name.
-
-    Args:
-        name: One of `names()`.
-        robot: Name or path of an arm, as the option; or an arm object, as in `make`.
-        controller: Name of a controller, or a controller object.
-        **options: More of the task's options, as in `make_options`.
-
-    Raises:
-        ValueError: Unknown task, option, or value; the message lists the valid ones.
-    """
-    if isinstance(controller, str):
-        options["controller"], controller = controller, None
-    if isinstance(robot, str):
-        options["robot"], robot = robot, None
-    return make(make_options(name, **options), robot, controller)
-
-
-def task(name: str) -> type[ArmEnv]:
-    """The class of a task.
-
-    Raises:
-        ValueError: Unknown task; the message lists the valid ones.
-    """
-    if name not in ENVS:
-        raise ValueError(unknown("env", name, names()))
-    return ENVS[name]
-
-
-def describe(name: str, **options: Any) -> str:
-    """A table of the task's observation: place, name, size, unit and meaning."""
-    rows, start = [("entries", "name", "unit", "meaning")], 0
-    for entry in load(name, **options).entries:
-        place = f"{start}" if entry.size == 1 else f"{start}:{start + entry.size}"
-        rows.append((place, entry.name, entry.unit, entry.meaning))
-        start += entry.size
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = (
-        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
-    return "\n".join(lines)
+# isort: split
+# After the module `task`, whose name the function takes.
+from .registry import ENVS as ENVS
+from .registry import describe as describe
+from .registry import load as load
+from .registry import make as make
+from .registry import make_options as make_options
+from .registry import names as names
+from .registry import task as task

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from envs.scene import ASSETS
-from envs.stands import EXACT, Need, Pose, Stand, lead, search
 from rmp_mjx.robot import Robot, RobotError
 from rmp_mjx.robot.inverse import hand_pose
+
+from .scene import ASSETS
+from .stands import EXACT, Need, Pose, Stand, lead, search
 
 JACO = "jaco2"
 """The arm that the tasks were made for."""

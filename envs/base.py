@@ -6,19 +6,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from envs import sight
-from envs.options import CTRL_DT
-from envs.placement import place_spheres
-from envs.randomisation import draw_model
-from envs.safety import SafetyRecord
-from envs.spheres import AWAY, LEVEL, Course, Spheres, draw_count, draw_speed
-from envs.task import OptionsT
-from envs.types import METRICS, Measures, State
-from envs.world import World
 from rmp_mjx.control import ACTION_SIZE
 from rmp_mjx.metric import Metric, by_name
 from rmp_mjx.robot.kinematics import SiteState, point_positions
 from rmp_mjx.sim import PhysicsState
+
+from . import sight
+from .options import CTRL_DT
+from .placement import place_spheres
+from .randomisation import draw_model
+from .safety import SafetyRecord
+from .spheres import AWAY, LEVEL, Course, Spheres, draw_count, draw_speed
+from .task import OptionsT
+from .types import METRICS, Measures, State
+from .world import World
 
 TOO_FAST = 1e3
 """A joint velocity beyond this counts as non-finite [rad/s]."""

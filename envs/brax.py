@@ -8,7 +8,7 @@ from brax.envs.base import Env
 from brax.envs.base import State as BraxState
 from jaxtyping import Array, Float
 
-from envs.base import ArmEnv
+from .base import ArmEnv
 
 
 class BraxTask(Env):

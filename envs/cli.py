@@ -7,10 +7,23 @@ from typing import Any, Generic, Literal
 
 import tyro
 
-import envs
-from envs.flags import (
+from rmp_mjx.fields import check
+from rmp_mjx.training.config import (
+    MOST,
+    SEEDS,
+    ConfigError,
+    PPOConfig,
+    RunConfig,
+    TrainConfig,
+)
+from rmp_mjx.training.runs import policies, run_folder
+from rmp_mjx.training.runs.checkpoint import NEWEST
+
+from . import registry
+from .flags import (
     DEFAULT,
     EnvName,
+    Processes,
     Task,
     TrainOptions,
     from_record,
@@ -19,12 +32,8 @@ from envs.flags import (
     parse,
     train_flags,
 )
-from envs.grid import GRID, Grid, load_grid, open_grid
-from envs.options import Options
-from rmp_mjx.fields import check
-from rmp_mjx.training.config import MOST, SEEDS, ConfigError, TrainConfig
-from rmp_mjx.training.runs import policies
-from rmp_mjx.training.runs.checkpoint import NEWEST
+from .grid import GRID, Grid, load_grid, open_grid
+from .options import Options
 
 
 def make_config(env: str = DEFAULT, **options: Any) -> TrainConfig:
@@ -37,13 +46,14 @@ def make_config(env: str = DEFAULT, **options: Any) -> TrainConfig:
     Raises:
         ValueError: Unknown task, option or value; the message lists the valid ones.
     """
-    return TrainConfig(envs.make_options(env)).replace(**options)
+    return TrainConfig(registry.make_options(env)).replace(**options)
 
 
 def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid | None]:
     """Parse the options of a training run or of a grid.
 
-    With `--resume RUN` the defaults are those that RUN was started with.
+    With `--resume RUN` the defaults are those that RUN was started with. A task that is
+    a `module:Class` must be named besides.
 
     Returns:
         The options, and the grid if there is one.
@@ -54,6 +64,8 @@ def parse_train(args: Sequence[str] | None = None) -> tuple[TrainOptions, Grid |
     given = named(args, "env", "envs", "controllers", "resume")
     saved: dict[str, TrainConfig] = {}
     controllers, tasks = given["controllers"], given["envs"]
+    for name in (tasks or given["env"] or DEFAULT).split(","):
+        _admit(name)
     if given["resume"]:
         folder = Path(given["resume"])
         if (folder / GRID).is_file():
@@ -144,7 +156,8 @@ class EvalOptions(Generic[Task]):
             return Path(self.out)
         if self.run:
             return policies.results_of(Path(self.run))
-        return Path("runs") / f"{self.agent}-{self.task.title.replace(', ', '-')}"
+        name = f"{self.agent}-{self.task.title.replace(', ', '-')}"
+        return Path("runs") / run_folder.name_of(name)
 
 
 def parse_eval(
@@ -160,10 +173,11 @@ def parse_eval(
             is no run folder.
     """
     given = named(args, "env", "run")
+    _admit(given["env"] or DEFAULT)
     path = policies.find(given["run"]) if given["run"] else None
     config = load_config(path) if path else None
     env = given["env"] or (config.task.env if config else DEFAULT)
-    task = envs.make_options(env)
+    task = registry.make_options(env)
     if config and config.task.env == env:
         task = config.task
     elif config:
@@ -188,6 +202,24 @@ def parse_eval(
             f"{options.seed_index}"
         )
     return options, config
+
+
+def _admit(name: str) -> None:
+    """Import a task that the user names; files may name it from then on.
+
+    Raises:
+        ValueError: There is none, or it has an option that is a flag already.
+    """
+    kind = registry.task(name).Options
+    parts = (TrainOptions, PPOConfig, RunConfig, Processes, EvalOptions)
+    taken = {field.name for part in parts for field in dataclasses.fields(part)}
+    shared = {field.name for field in dataclasses.fields(Options)}
+    both = [f.name for f in dataclasses.fields(kind) if f.name in taken - shared]
+    if both:
+        raise ConfigError(
+            f"{kind.__name__}: {', '.join(both)}: training or evaluation has an option "
+            "of this name; give yours another one"
+        )
 
 
 def _without_physics(kind: type[Options]) -> type[Options]:

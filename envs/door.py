@@ -10,13 +10,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs import options
-from envs.base import ArmEnv
-from envs.safety import SafetyRecord
-from envs.scene import ASSETS, Contacts
-from envs.stands import Box, Place
-from envs.task import View
-from envs.types import Entry, Score
 from rmp_mjx.control import Controller
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.metric import Metric
@@ -24,6 +17,14 @@ from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
+
+from . import options
+from .base import ArmEnv
+from .safety import SafetyRecord
+from .scene import ASSETS, Contacts
+from .stands import Box, Place
+from .task import View
+from .types import Entry, Score
 
 
 class Variant(NamedTuple):

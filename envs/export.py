@@ -13,13 +13,14 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-import envs
-from envs.flags import load_config, parse
 from rmp_mjx import runtime
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.policy import save_policy
 from rmp_mjx.training.runs import policies
 from rmp_mjx.training.runs.checkpoint import NEWEST, CheckpointError
+
+from . import registry
+from .flags import load_config, parse
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class ExportOptions:
     training's episodes), or an iteration's number."""
     seed_index: int = 0
     """Which agent of a run that trained several seeds, from 0."""
+    env: str | None = None
+    """The run's task, if it is a module:Class."""
 
 
 def export(options: ExportOptions, note: Callable[[str], None]) -> None:
@@ -56,10 +59,12 @@ def export(options: ExportOptions, note: Callable[[str], None]) -> None:
         raise ConfigError(f"{file} exists already: delete it, or name another file")
     if not file.parent.is_dir():
         raise ConfigError(f"{file}: there is no folder {file.parent}")
+    if options.env:
+        registry.task(options.env)
     config = load_config(run)
     if not 0 <= k < config.ppo.num_seeds:
         raise ConfigError(f"seed_index must lie in 0 .. {config.ppo.num_seeds - 1}")
-    env = envs.make(config.task)
+    env = registry.make(config.task)
     iterations, agent = policies.load_agent(
         env, config, run, True, note, k, options.checkpoint
     )

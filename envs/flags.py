@@ -13,20 +13,24 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-import envs
-from envs.options import Options
 from rmp_mjx.fields import arguments, check
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.policy import is_policy, load_policy
 from rmp_mjx.training.records import config_of, read_record
 from rmp_mjx.training.runs.run_folder import CONFIG
 
+from . import outside, registry
+from .options import Options
+
 DEFAULT = "trajectory"
 """Task where none is named."""
 
 Task = TypeVar("Task", bound=Options)
 Parsed = TypeVar("Parsed")
-EnvName = Annotated[str, tyro.conf.arg(metavar="{" + ",".join(envs.names()) + "}")]
+EnvName = Annotated[
+    str,
+    tyro.conf.arg(metavar="{" + ",".join([*registry.names(), "module:Class"]) + "}"),
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +80,7 @@ def train_flags(
     quiet: bool = False,
 ) -> TrainOptions:
     """Parse the flags of a training run; what is not given is as it was saved."""
-    kind = envs.task(env).Options
+    kind = registry.task(env).Options
     config = saved or TrainConfig(kind())
     run = dataclasses.replace(
         config.run, resume=None, run_dir=None, overwrite=False, allow_changes=False
@@ -118,6 +122,26 @@ def parse(
     )
 
 
+PROGRAMS = {"train": "python train.py", "replay": "python -m envs.replay"}
+"""Commands in a checkout."""
+INSTALLED = "rmp-mjx-"
+"""How their names begin where they are installed."""
+
+
+def typed(command: str, flag: str = "env", *tasks: str) -> str:
+    """What to type for a command; it names the tasks that no file may import.
+
+    Args:
+        command: train or replay.
+        flag: The flag that names tasks.
+        *tasks: The tasks that the command meets.
+    """
+    installed = Path(sys.argv[0]).name.startswith(INSTALLED)
+    program = INSTALLED + command if installed else PROGRAMS[command]
+    outside_tasks = any(map(outside.is_path, tasks))
+    return f"{program} --{flag} {','.join(tasks)}" if outside_tasks else program
+
+
 def named(args: Sequence[str] | None, *names: str) -> dict[str, str | None]:
     """Values of the flags that decide which others there are.
 
@@ -148,14 +172,16 @@ def named(args: Sequence[str] | None, *names: str) -> dict[str, str | None]:
 def from_record(record: Mapping[str, Any]) -> TrainConfig[Options]:
     """A configuration from its JSON record; missing fields take defaults.
 
-    Records of version 0.1 were flat: their values are parsed as flags.
+    No module is imported because a record names it (`envs.outside`). Records of version
+    0.1 were flat: their values are parsed as flags.
 
     Raises:
         ConfigError: It has unknown fields, or values that cannot be run.
     """
     try:
         if "ppo" in record:
-            return config_of(record, lambda task: envs.make_options(**task))
+            return config_of(record, registry.recorded)
+        outside.check_recorded(record["env"])
         return train_flags(record["env"], _flags(record), quiet=True).config
     except SystemExit as error:
         raise ConfigError("no configuration of this version, nor of 0.1") from error

@@ -21,6 +21,8 @@ from rmp_mjx.training.config import (
 )
 from rmp_mjx.training.runs import distributed, run_folder
 
+from .flags import typed
+
 GRID = "grid.json"
 FAILED, INTERRUPTED = 1, 128
 """Exit codes of a run: this one, and those above the second."""
@@ -40,12 +42,12 @@ class Grid:
     def cells(self) -> dict[str, TrainConfig]:
         """Configurations by the name of their cell, new ones or to be resumed."""
         return {
-            f"{env}-{controller}": self._cell(env, controller)
+            _name(env, controller): self._cell(env, controller)
             for env, controller in itertools.product(self.configs, self.controllers)
         }
 
     def _cell(self, env: str, controller: str) -> TrainConfig:
-        folder, config = self.folder / f"{env}-{controller}", self.configs[env]
+        folder, config = self.folder / _name(env, controller), self.configs[env]
         can_resume = config.trainer == "ours"
         begun = can_resume and (folder / run_folder.CONFIG).exists()
         return config.replace(
@@ -72,6 +74,11 @@ class Grid:
             "finished": finished,
         }
         write_text(self.folder / GRID, json.dumps(document, indent=2) + "\n")
+
+
+def _name(env: str, controller: str) -> str:
+    """The name of a cell and of its folder."""
+    return run_folder.name_of(f"{env}-{controller}")
 
 
 def load_grid(folder: Path) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
@@ -127,7 +134,7 @@ def run(grid: Grid, train: Callable[[TrainConfig], int], console: Console) -> in
         code of the cell during which a signal came.
     """
     finished, failed, spent = grid.finished(), [], []
-    cells = grid.cells()
+    cells, again = grid.cells(), typed("train", "envs", *grid.configs)
     if distributed.is_primary():
         grid.save(finished)
     for number, (name, config) in enumerate(cells.items(), 1):
@@ -141,7 +148,7 @@ def run(grid: Grid, train: Callable[[TrainConfig], int], console: Console) -> in
         code = train(config)
         if code > INTERRUPTED:
             console.print(
-                f"continue the grid with\n  python train.py --resume {grid.folder}",
+                f"continue the grid with\n  {again} --resume {grid.folder}",
                 highlight=False,
             )
             return code

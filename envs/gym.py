@@ -22,9 +22,10 @@ from gymnasium.vector import (
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Int, Key
 
-from envs.base import ArmEnv
-from envs.types import State
 from rmp_mjx.trees import cast_like, select
+
+from .base import ArmEnv
+from .types import State
 
 LARGEST_SEED = 2**31
 """Upper bound of the drawn seeds."""

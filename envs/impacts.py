@@ -29,13 +29,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from envs.scene import ARM, Scene
 from rmp_mjx.math import exp_so3, psd_solve, quat_to_mat
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, base_point
 from rmp_mjx.sim import PhysicsState, read_contacts
+
+from .scene import ARM, Scene
 
 AT_FAULT = 0.01
 """A collision that begins while the arm itself moves towards the body faster than this

@@ -6,14 +6,15 @@ import dataclasses
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from envs.arms import JACO
-from envs.placement import Layout
-from envs.randomisation import Randomisation
 from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.vices import OSC
 from rmp_mjx.fields import check
 from rmp_mjx.robot.library import find
+
+from .arms import JACO
+from .placement import Layout
+from .randomisation import Randomisation
 
 ControllerName = Literal["rmp_vices", "vices", "rmp_vices_literal", "osc", "vices_cbf"]
 

@@ -7,15 +7,16 @@ that file is placed when a task loads it.
 import sys
 from collections.abc import Sequence
 
-import envs
-from envs.arms import need
-from envs.stands import search
 from rmp_mjx.robot import Robot, RobotError
+
+from .arms import need
+from .registry import ENVS
+from .stands import search
 
 
 def main(names: Sequence[str]) -> int:
     """Search and print; returns the exit code."""
-    needs = [need(task) for task in envs.ENVS.values()]
+    needs = [need(task) for task in ENVS.values()]
     for name in names:
         try:
             stand = search(Robot.load(name, finger=0.0), needs)

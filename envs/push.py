@@ -12,19 +12,20 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs import options
-from envs.base import ArmEnv
-from envs.placement import CANDIDATES
-from envs.safety import SafetyRecord
-from envs.scene import ASSETS, TABLE_HEIGHT, Contacts
-from envs.stands import Place
-from envs.task import GOAL, Mark
-from envs.types import Entry, Score, State
 from rmp_mjx.math import quat_to_mat
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
+
+from . import options
+from .base import ArmEnv
+from .placement import CANDIDATES
+from .safety import SafetyRecord
+from .scene import ASSETS, TABLE_HEIGHT, Contacts
+from .stands import Place
+from .task import GOAL, Mark
+from .types import Entry, Score, State
 
 HALF_SIZE = 0.03
 """Half an edge of the block [m]."""

@@ -14,8 +14,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from envs.scene import ARM
 from rmp_mjx.pytree import Pytree
+
+from .scene import ARM
 
 Range = tuple[float, float]
 """Least and greatest value; each draw is uniform between them."""

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from envs.base import ArmEnv
-from envs.task import Mark
-from envs.types import State
+from .base import ArmEnv
+from .task import Mark
+from .types import State
 
 SIZE = (480, 640)
 """Height and width of a frame [pixels]."""

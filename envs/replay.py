@@ -23,14 +23,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-import envs
-from envs.flags import from_record
 from rmp_mjx import runtime
 from rmp_mjx.fields import arguments
 from rmp_mjx.training.learning import faults
 from rmp_mjx.training.learning.rollout import VALUE_LIMIT
 from rmp_mjx.training.runs import run_folder
 from rmp_mjx.trees import named_leaves
+
+from . import registry
+from .base import ArmEnv
+from .flags import from_record
+from .types import State
 
 SPEED_LIMIT = 1e3
 """Joint speeds beyond this count as bad; so they do in the tasks [rad/s]."""
@@ -58,9 +61,7 @@ class Finding(NamedTuple):
     """What it was."""
 
 
-def policy_step(
-    env: envs.ArmEnv, state: envs.State, action: np.ndarray
-) -> Iterator[Moment]:
+def policy_step(env: ArmEnv, state: State, action: np.ndarray) -> Iterator[Moment]:
     """Go through a policy step as `ArmEnv.step` does, physics by MuJoCo itself.
 
     Args:
@@ -172,7 +173,7 @@ def choose(path: Path) -> Path:
     return min(files, key=lambda file: faults.about(file)["iteration"])
 
 
-def read(path: Path) -> tuple[envs.ArmEnv, envs.State, np.ndarray, dict[str, Any]]:
+def read(path: Path) -> tuple[ArmEnv, State, np.ndarray, dict[str, Any]]:
     """The task, state, action and origin in a file.
 
     Raises:
@@ -180,7 +181,7 @@ def read(path: Path) -> tuple[envs.ArmEnv, envs.State, np.ndarray, dict[str, Any
     """
     about = faults.about(path)
     config = from_record(about["config"])
-    env = envs.make(config.replace(physics="mujoco").task)
+    env = registry.make(config.replace(physics="mujoco").task)
     template = jax.eval_shape(env.reset, jax.random.key(0))
     state, action = faults.load(path, template)
     return env, state, action, about
@@ -193,11 +194,14 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--limit", type=float, default=VALUE_LIMIT, help="greatest good magnitude"
     )
+    parser.add_argument("--env", help="the run's task, if it is a module:Class")
     say = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
     try:
         options = parser.parse_args(arguments(args))
         if not options.limit > 0:
             raise ValueError(f"limit must be positive, is {options.limit}")
+        if options.env:
+            registry.task(options.env)
         runtime.configure()
         env, state, action, about = read(choose(options.dump))
     except (ValueError, OSError) as error:

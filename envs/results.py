@@ -8,8 +8,6 @@ import jax
 import polars as pl
 from rich.console import Console
 
-from envs.base import ArmEnv
-from envs.options import Options
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluation import curves, evaluate, film, report
 from rmp_mjx.training.evaluation.learning_curve import (
@@ -21,6 +19,9 @@ from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.networks import Agent
 from rmp_mjx.training.runs import distributed, metrics, policies, run_folder
 from rmp_mjx.training.runs.loop import TrainResult
+
+from .base import ArmEnv
+from .options import Options
 
 
 def are_complete(config: TrainConfig, folder: Path) -> bool:
@@ -102,7 +103,7 @@ def evaluate_seeds(
         shown = report.save_over_seeds(columns, about, folder)
     console.print(report.table(shown, config.title, env.metrics))
     if config.run.video:
-        from envs.render import render  # loads graphics libraries
+        from .render import render  # loads graphics libraries
 
         film.publish(partial(render, env), tapes[0], env.dt, folder, console)
 

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from envs.scene import Scene
 from rmp_mjx.metric import Metric, of_fields
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
 from rmp_mjx.sim import PhysicsState, read_contacts
 from rmp_mjx.types import Constant
+
+from .scene import Scene
 
 REVERSAL = 1.0
 """A torque reverses if it changes by more than this one way, then the other [N m]."""

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.types import Entry
 from rmp_mjx.math import safe_norm
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.shapes import Spheres
 from rmp_mjx.types import Constant
+
+from .types import Entry
 
 FADE = 0.15
 """Distance of a centre from the grip over which its closeness falls by e [m]."""

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from envs.scene import TABLE_HEIGHT
 from rmp_mjx.robot import Robot, RobotError
 from rmp_mjx.robot.configurations import (
     capsule_ends,
@@ -18,6 +17,8 @@ from rmp_mjx.robot.configurations import (
 )
 from rmp_mjx.robot.inverse import hand_pose, reach
 from rmp_mjx.robot.posture import manipulability
+
+from .scene import TABLE_HEIGHT
 
 TURN = np.pi / 4
 """Turns of the grip about the finger are multiples of this [rad]."""

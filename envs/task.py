@@ -10,17 +10,18 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs import sight
-from envs.options import Options as TaskOptions
-from envs.safety import SafetyRecord
-from envs.scene import Contacts, no_objects
-from envs.stands import Place
-from envs.types import ARM_ENTRIES, Entry, Score, State
 from rmp_mjx.metric import Metric
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
+
+from . import sight
+from .options import Options as TaskOptions
+from .safety import SafetyRecord
+from .scene import Contacts, no_objects
+from .stands import Place
+from .types import ARM_ENTRIES, Entry, Score, State
 
 Color = tuple[float, float, float, float]
 """Red, green, blue and opacity, each 0 to 1."""

@@ -10,16 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs import options
-from envs.base import ArmEnv
-from envs.placement import sample_apart
-from envs.safety import SafetyRecord
-from envs.stands import Place
-from envs.task import CURRENT, LATER, REACHED, Mark
-from envs.types import Entry, Score, State
 from rmp_mjx.metric import Metric
 from rmp_mjx.robot.kinematics import SiteState
 from rmp_mjx.sim import PhysicsState
+
+from . import options
+from .base import ArmEnv
+from .placement import sample_apart
+from .safety import SafetyRecord
+from .stands import Place
+from .task import CURRENT, LATER, REACHED, Mark
+from .types import Entry, Score, State
 
 BOX_LOW = np.array([0.30, -0.20, 0.03])
 BOX_HIGH = np.array([0.55, 0.20, 0.28])

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs import safety
-from envs.randomisation import Motors
 from rmp_mjx.control.observer import ContactMemory
 from rmp_mjx.metric import SUCCESS, Metric, of_fields
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.sim import PhysicsState
+
+from . import safety
+from .randomisation import Motors
 
 
 class Entry(NamedTuple):

@@ -12,15 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs import impacts
-from envs.arms import JACO, fit
-from envs.options import CONTROLLERS, substeps
-from envs.randomisation import draw_motors
-from envs.safety import Motion, SafetyRecord, Torques, observe
-from envs.scene import TABLE_HEIGHT, build_scene
-from envs.spheres import Spheres
-from envs.task import OptionsT, Task
-from envs.types import ControlMemory
 from rmp_mjx import sim
 from rmp_mjx.control import (
     Controller,
@@ -42,6 +33,16 @@ from rmp_mjx.shapes import Gap
 from rmp_mjx.sim import PhysicsState
 from rmp_mjx.types import ControlOutput, Setpoint
 from rmp_mjx.vec import Vec
+
+from . import impacts
+from .arms import JACO, fit
+from .options import CONTROLLERS, substeps
+from .randomisation import draw_motors
+from .safety import Motion, SafetyRecord, Torques, observe
+from .scene import TABLE_HEIGHT, build_scene
+from .spheres import Spheres
+from .task import OptionsT, Task
+from .types import ControlMemory
 
 
 class Noise(Pytree):

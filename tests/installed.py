@@ -5,6 +5,7 @@ Run by a Python that has the package and its core dependencies, from another fol
 
 import importlib.resources
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 
@@ -23,8 +24,16 @@ def main() -> None:
     place = Path(rmp.__file__).resolve()
     assert Path(sys.prefix).resolve() in place.parents, f"imported from {place}"
     assert (importlib.resources.files("rmp_mjx") / "py.typed").is_file()
-    for absent in ("envs", "benchmarks", "brax", "polars", "tyro", "matplotlib"):
+    for absent in ("envs", "train", "eval", "tests", "benchmarks"):
+        assert importlib.util.find_spec(absent) is None, f"{absent} is installed"
+    for absent in ("brax", "polars", "tyro", "matplotlib"):
         assert importlib.util.find_spec(absent) is None, f"{absent} is not asked for"
+    for name in ("train", "eval", "replay", "check-robot"):
+        command = [Path(sys.executable).with_name(f"rmp-mjx-{name}"), "--help"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 2, done
+        assert "pip install 'rmp-mjx[train]'" in done.stderr, done.stderr
+        assert len(done.stderr.splitlines()) == 1, done.stderr
 
     robot = rmp.Robot.load("jaco2")
     q, qd = jnp.asarray(robot.q_home, jnp.float32), jnp.zeros(robot.n)

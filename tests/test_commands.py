@@ -1,7 +1,6 @@
 """Hostile command lines: each ends in one sentence and leaves nothing behind."""
 
 import dataclasses
-import importlib
 import json
 import random
 import sys
@@ -10,10 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-import envs
-import train
 from benchmarks.paper import __main__ as paper
-from envs import cli, export, replay
+from envs import cli, export, registry, replay, train
+from envs import eval as evaluate
 from envs.flags import Processes, TrainOptions
 from rmp_mjx.report import __main__ as report
 from rmp_mjx.training.config import PPOConfig, RunConfig
@@ -23,7 +21,6 @@ from rmp_mjx.training.runs.loop import TrainResult
 from tests.envs import arm_tasks
 from tests.training import toys
 
-evaluate = importlib.import_module("eval")
 COMMANDS = {
     "train": train.main,
     "eval": evaluate.main,
@@ -110,7 +107,7 @@ def places(tmp_path, monkeypatch):
     arm_tasks.register(monkeypatch)
     toy = toys.Counter()
     stopped = TrainResult(lambda obs, key: obs, 1, 130, False)
-    monkeypatch.setattr(envs, "make", lambda *given: toy)
+    monkeypatch.setattr(registry, "make", lambda *given: toy)
     monkeypatch.setattr(train, "learn", lambda *given: stopped)
     monkeypatch.setattr(paper.training, "run", lambda *given: 1)
 

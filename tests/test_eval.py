@@ -1,7 +1,6 @@
 """`eval.py`: a run's policy and trivial agents, on a toy task."""
 
 import dataclasses
-import importlib
 import json
 import shutil
 
@@ -9,6 +8,7 @@ import polars as pl
 import pytest
 
 import envs
+from envs import eval as evaluation
 from rmp_mjx.training.runs import policies
 from tests.envs import arm_tasks
 from tests.training.conftest import run
@@ -32,7 +32,7 @@ def asked(monkeypatch):
 
 @pytest.fixture
 def evaluate(asked):
-    return importlib.import_module("eval").main
+    return evaluation.main
 
 
 def test_a_run_is_evaluated_into_its_folder(evaluate, tmp_path, capsys):

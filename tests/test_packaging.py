@@ -1,3 +1,4 @@
+import importlib
 import re
 import tomllib
 import zipfile
@@ -31,16 +32,41 @@ def locked(root):
     return dict(re.findall(r"^(\S+)==(\S+)", text, re.M))
 
 
-def test_the_wheels_only_top_level_name_is_rmp_mjx(wheel):
+def test_the_wheels_top_level_names_are_the_librarys_and_the_tasks(wheel):
+    """Nothing called `envs`, `train`, `eval`, `tests` or `benchmarks`."""
     top = {name.split("/")[0] for name in wheel}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"rmp_mjx"}
+    found = {name for name in top if not name.endswith(".dist-info")}
+    assert found == {"rmp_mjx", "rmp_mjx_envs"}
 
 
-def test_the_wheel_carries_every_module_and_robot_description(wheel, root):
-    files = [p for p in (root / "rmp_mjx").rglob("*") if p.suffix in {".py", ".xml"}]
-    wanted = {p.relative_to(root).as_posix() for p in files}
+@pytest.mark.parametrize(
+    ("folder", "installed"), [("rmp_mjx", "rmp_mjx"), ("envs", "rmp_mjx_envs")]
+)
+def test_the_wheel_carries_every_module_and_description(wheel, root, folder, installed):
+    kinds = {".py", ".xml", ".toml", ".typed"}
+    files = [p for p in (root / folder).rglob("*") if p.suffix in kinds]
+    files.append(root / folder / "py.typed")
+    wanted = {f"{installed}/{p.relative_to(root / folder).as_posix()}" for p in files}
     assert any(name.endswith(".xml") for name in wanted)
     assert wanted <= wheel
+
+
+def test_the_console_commands_are_functions_of_the_package(project):
+    scripts = project["scripts"]
+    assert set(scripts) == {
+        f"rmp-mjx-{name}" for name in ("train", "eval", "replay", "check-robot")
+    }
+    for target in scripts.values():
+        module, _, function = target.partition(":")
+        assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_an_editable_install_copies_nothing(root, tmp_path):
+    (path,) = WheelBuilder(str(root)).build(
+        directory=str(tmp_path), versions=["editable"]
+    )
+    files = zipfile.ZipFile(path).namelist()
+    assert [name for name in files if ".dist-info/" not in name] == ["_rmp_mjx.pth"]
 
 
 def test_the_wheel_carries_the_licence(wheel):

@@ -4,6 +4,7 @@ import importlib.util
 import re
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,9 @@ def test_the_commands_of_the_documents_exist(document, command):
         target = next(w for w in words[1:] if "=" not in w)
         makefile = (ROOT / "Makefile").read_text()
         assert re.search(rf"^{re.escape(target)}:", makefile, re.M), target
+    elif words[0].startswith("rmp-mjx-"):
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        assert words[0] in project["scripts"]
     elif words[0] in ("python", ".venv/bin/python"):
         if words[1] == "-m":
             assert importlib.util.find_spec(words[2]), f"no module {words[2]}"

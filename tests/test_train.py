@@ -8,8 +8,7 @@ import sys
 import polars as pl
 import pytest
 
-import train
-from envs import grid
+from envs import grid, train
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.policy import load_policy
 from tests.envs import arm_tasks

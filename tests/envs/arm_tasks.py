@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-import envs
+from envs import registry
 from envs.options import Options
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.robot import Robot
@@ -121,12 +121,12 @@ class Counter:
 
 def register(monkeypatch):
     """Make the toy known; returns the options that tasks are made with from then on."""
-    made, make = [], envs.make
+    made, make = [], registry.make
 
     def noted(options, *rest):
         made.append(options)
         return make(options, *rest)
 
-    monkeypatch.setitem(envs.ENVS, "counter", Counter)
-    monkeypatch.setattr(envs, "make", noted)
+    monkeypatch.setitem(registry.ENVS, "counter", Counter)
+    monkeypatch.setattr(registry, "make", noted)
     return made

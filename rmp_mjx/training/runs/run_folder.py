@@ -86,7 +86,12 @@ def default_run_dir(config: TrainConfig) -> Path:
     """A new folder name under runs/, from the task, the seed and the time."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
     task = config.task.title.replace(", ", "-")
-    return Path("runs") / f"{task}-seed{config.ppo.seed}-{stamp}"
+    return Path("runs") / name_of(f"{task}-seed{config.ppo.seed}-{stamp}")
+
+
+def name_of(text: str) -> str:
+    """A folder's name: to some programs a colon would make it another machine's."""
+    return text.replace(":", ".")
 
 
 def seed_folders(config: TrainConfig, folder: Path) -> list[Path]:
@@ -315,7 +320,13 @@ def versions() -> dict[str, str]:
 
 
 def _git_revision() -> str:
-    """Revision of the working directory, with a mark for uncommitted changes."""
+    """Revision of the checkout, with a mark for uncommitted changes.
+
+    An installed package is not part of the repository that its environment may be in.
+    """
+    root = Path(__file__).parents[3]
+    if not (root / ".git").exists():
+        return "unknown"
     try:
         done = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--abbrev=12"],
@@ -323,7 +334,7 @@ def _git_revision() -> str:
             text=True,
             timeout=10,
             check=False,
-            cwd=Path(__file__).parent,
+            cwd=root,
         )
     except (OSError, subprocess.TimeoutExpired):
         return "unknown"
