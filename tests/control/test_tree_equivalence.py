@@ -30,9 +30,9 @@ quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
 class Definition(AutodiffRMPVICES):
     """The tree behind a closed form whose results are spoilt: it takes none of them."""
 
-    def unguarded(self, *args):
+    def unguarded(self, *args, **kwargs):
         """What the closed form gives, and wrong."""
-        out = super().unguarded(*args)
+        out = super().unguarded(*args, **kwargs)
         f, M, qdd = out.f + 1.0, out.M + 1.0, out.qdd + 1.0
         return out.replace(f=f, M=M, qdd=qdd, tau=0.5 * out.tau)
 
