@@ -1,10 +1,11 @@
-"""Policies of one arm on all others, without training: `python -m benchmarks.arms`.
+"""Every arm under random policies, and under the policies of all others.
 
-A row of a table is the arm that a policy was trained with, a column the arm that it
-commands; each cell is a number of whole episodes under the mean action, the same starts
-in every row. Policies are TASK-rmp_vices-ARM.safetensors in a folder, the Jaco 2's
-TASK-rmp_vices.safetensors. Run as
-``python -m benchmarks.arms --json FILE --docs docs/results/arms.md``.
+Random policies first: events of VICES and of RMP-VICES, each arm in its place. Then the
+policies of one arm command another, without training. A row of a table is the arm that
+a policy was trained with, a column the arm that it commands; each cell is a number of
+whole episodes under the mean action, the same starts in every row. Policies are
+TASK-rmp_vices-ARM.safetensors in a folder, the Jaco 2's TASK-rmp_vices.safetensors. Run
+as ``python -m benchmarks.arms --json FILE --docs docs/results/arms.md``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 import envs
 from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
+from benchmarks.studies import random_policies
 from envs.arms import JACO
 from rmp_mjx import runtime
 from rmp_mjx.training.evaluation.evaluate import recorder
@@ -37,6 +39,57 @@ COUNTED = ("joint_velocity", "torque_rate")
 """Events of the motors, which do not."""
 
 
+CONTROLLERS = ("vices", "rmp_vices")
+"""Controllers under the random policies."""
+
+
+def under_random_policies(quick: bool) -> list[Row]:
+    """Events of every arm, all random policies together."""
+    rows = []
+    for arm in ARMS:
+        names = [f"--controller={name}" for name in CONTROLLERS]
+        args = random_policies.parse([f"--robot={arm}", *names, *["--quick"] * quick])
+        for name, found in zip(
+            CONTROLLERS, random_policies.measure_all(args), strict=True
+        ):
+            value = {row.key: row for row in found}
+            for event in (*EVENTS, "joint_velocity"):
+                one = [
+                    value[f"{name}_{policy}_{event}"]
+                    for policy in random_policies.RANDOM
+                ]
+                counts = [int(row.note.split()[0]) for row in one]
+                steps = [int(row.note.split()[2]) for row in one]
+                note = f"{sum(counts)} in {sum(steps)} policy steps"
+                rate = 1e3 * sum(counts) / sum(steps)
+                rows.append(
+                    Row(f"random/{arm}/{name}/{event}", rate, "1/1000 steps", note)
+                )
+    return rows
+
+
+def random_table(rows: Sequence[Row]) -> str:
+    """Events per 1,000 policy steps, VICES -> RMP-VICES."""
+    found = {row.key: row.value for row in rows}
+    titles = {
+        "collisions, self included": ("collision", "self_collision"),
+        "joint limits": ("joint_limit",),
+        "joints faster than their limit": ("joint_velocity",),
+    }
+
+    def cell(arm: str, events: Sequence[str]) -> str:
+        before, after = (
+            sum(found[f"random/{arm}/{name}/{event}"] for event in events)
+            for name in CONTROLLERS
+        )
+        return f"{before:.3g} -> **{after:.2g}**"
+
+    lines = [
+        (f"`{arm}`", *(cell(arm, each) for each in titles.values())) for arm in ARMS
+    ]
+    return markdown(["arm", *titles], lines)
+
+
 def policies_of(task: str, folder: Path) -> dict[str, Policy]:
     """The policies of a task by the arm that they were trained with."""
     names = {arm: "" if arm == JACO else f"-{arm}" for arm in TRAINED}
@@ -47,10 +100,10 @@ def policies_of(task: str, folder: Path) -> dict[str, Policy]:
 def judged(results: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Which episodes succeed, and in which something happens."""
     happened = {
-        name: np.any([results[f"episode/{each}"] > 0 for each in group], axis=0)
+        name: np.any([results[each] > 0 for each in group], axis=0)
         for name, group in {"event": EVENTS, "motor": COUNTED}.items()
     }
-    success = results["episode/success"] > 0
+    success = results["success"] > 0
     return {"success": success & ~happened["event"]} | happened
 
 
@@ -63,7 +116,7 @@ def measure(task: str, folder: Path, episodes: int, seed: int) -> list[Row]:
         for own, policy in policies.items():
             agent = policy.agent(env.observation_size, env.action_size, True)
             results, _ = run(agent, jax.random.key(seed))
-            fastest = float(np.max(results["episode/joint_speed"]))
+            fastest = float(np.max(results["joint_speed"]))
             for name, hits in judged(results).items():
                 low, high = clopper_pearson(int(hits.sum()), episodes)
                 note = f"{hits.sum()} of {episodes}; 95 % interval "
@@ -98,22 +151,23 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--policies", type=Path, default=ROOT / "pretrained")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=7000)
+    parser.add_argument("--quick", action="store_true", help="few random steps")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--docs", type=Path)
     args = parser.parse_args(argv)
     runtime.configure(split_cpu=True)
-    rows: list[Row] = []
+    rows = under_random_policies(args.quick)
     for task in args.tasks:
         rows += measure(task, args.policies, args.episodes, args.seed)
         show(rows, task)
         if args.json:
             settings = {"episodes": args.episodes, "seed": args.seed}
             write_json(args.json, rows, **settings)
-    text = "\n\n".join(table(task, rows) for task in args.tasks)
-    print(text)
+    matrix = "\n\n".join(table(task, rows) for task in args.tasks)
+    tables = {"random": random_table(rows), "arms": matrix}
+    print(*tables.values(), sep="\n\n")
     if args.docs:
-        page = insert(args.docs.read_text(), {"arms": text})
-        args.docs.write_text(page)
+        args.docs.write_text(insert(args.docs.read_text(), tables))
 
 
 if __name__ == "__main__":

@@ -16,9 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+import envs
 import rmp_mjx as rmp
 from benchmarks.common import Row, insert, markdown, show, write_json
 from benchmarks.studies.safety_study import ENDING, EVENTS, Group, Study
+from envs.arms import JACO
 from envs.placement import LAYOUTS
 from rmp_mjx import runtime
 from rmp_mjx.control.torque import clip_torque, torque_range
@@ -206,6 +208,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=560, help="policy steps per world")
     parser.add_argument("--physics", choices=("mujoco", "mjx"), default="mujoco")
     parser.add_argument("--sim-dt", type=float, default=0.005, help="[s]")
+    parser.add_argument("--robot", default=JACO, help="arm, by name or path")
     parser.add_argument("--armature", default="physical", help="rotor inertias")
     parser.add_argument(
         "--layout",
@@ -223,14 +226,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "--go-on", action="store_true", help="an event does not end the episode"
     )
     args = parser.parse_args(argv)
-    if args.docs and args.controller:
-        parser.error("--docs needs all controllers: leave --controller out")
+    if args.docs and (args.controller or args.robot != JACO):
+        parser.error("--docs has the Jaco 2 under all controllers: leave both out")
     return args
 
 
-def groups(envs: int, layout: str) -> list[Group]:
+def groups(count: int, layout: str) -> list[Group]:
     """2/8 of the worlds for each random policy, 1/8 for each reaching test."""
-    share = max(envs // 8, 1)
+    share = max(count // 8, 1)
     return [
         *(Group(policy, 2 * share, layout) for policy in RANDOM),
         Group("straight", share, None, REACHING_LIMIT),
@@ -303,11 +306,18 @@ def reaching_rows(name: str, scene: str, figures: Figures) -> list[Row]:
     ]
 
 
+def arm_of(name: str, armature: str) -> rmp.Robot:
+    """The Jaco 2 at its own `q_home`, or an arm as the task sets it up."""
+    if name == JACO:
+        return rmp.Robot.load(JACO, armature=armature)
+    return envs.load("trajectory", robot=name, armature=armature).robot
+
+
 def measure_all(args: argparse.Namespace) -> Iterator[list[Row]]:
     """The rows of one controller after the other."""
-    robot = rmp.Robot.load("jaco2", armature=args.armature)
-    envs, steps = (32, 320) if args.quick else (args.envs, args.steps)
-    worlds = groups(envs, args.layout)
+    robot = arm_of(args.robot, args.armature)
+    count, steps = (32, 320) if args.quick else (args.envs, args.steps)
+    worlds = groups(count, args.layout)
     studies: dict[type, Study] = {}
     for name in args.controller or CONTROLLERS:
         controller = CONTROLLERS[name][0](robot)
@@ -317,7 +327,7 @@ def measure_all(args: argparse.Namespace) -> Iterator[list[Row]]:
                 controller,
                 worlds,
                 steps,
-                robot=robot,
+                robot=robot if args.robot == JACO else args.robot,
                 physics=args.physics,
                 sim_dt=args.sim_dt,
                 terminate_on_event=not args.go_on,

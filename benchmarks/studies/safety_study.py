@@ -23,7 +23,14 @@ from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.learning.networks import Agent
 from rmp_mjx.vec import xyz
 
-EVENTS = ("collision", "arm_collision", "self_collision", "joint_limit", "turn_limit")
+EVENTS = (
+    "collision",
+    "arm_collision",
+    "self_collision",
+    "joint_limit",
+    "turn_limit",
+    "joint_velocity",
+)
 """Events that are reported."""
 
 ENDING = ("collision", "self_collision", "joint_limit")

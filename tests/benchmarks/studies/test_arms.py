@@ -8,7 +8,7 @@ from benchmarks.studies import arms
 
 def results(**counts):
     names = (*arms.EVENTS, *arms.COUNTED, "success")
-    return {f"episode/{name}": np.array(counts.get(name, [0, 0, 0])) for name in names}
+    return {name: np.array(counts.get(name, [0, 0, 0])) for name in names}
 
 
 def test_an_episode_with_an_event_is_no_success():
@@ -45,3 +45,14 @@ def test_a_table_has_a_row_for_each_policy_and_marks_its_own_arm():
 def test_the_policies_that_ship_are_found_by_their_arm(root):
     found = arms.policies_of("door", root / "pretrained")
     assert list(found) == list(arms.TRAINED)
+
+
+def test_random_events_are_summed_and_shown_from_vices_to_ours():
+    rows = [
+        Row(f"random/{arm}/{name}/{event}", value, "1/1000 steps", "")
+        for arm in arms.ARMS
+        for name, value in zip(arms.CONTROLLERS, (4.0, 0.0), strict=True)
+        for event in (*arms.EVENTS, "joint_velocity")
+    ]
+    line = arms.random_table(rows).splitlines()[3]
+    assert line == "| `panda` | 8 -> **0** | 4 -> **0** | 4 -> **0** |"
