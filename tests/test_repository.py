@@ -14,7 +14,7 @@ from rmp_mjx.training.policy import load_policy
 from rmp_mjx.training.runs import policies
 
 ROOT = Path(__file__).resolve().parents[1]
-MOST_BYTES, MOST_FILES = 5_500_000, 440
+MOST_BYTES, MOST_FILES = 5_800_000, 480
 SHARDS = {"checkpoints", "ocdbt.process_0"}
 """Folders of an Orbax checkpoint."""
 
@@ -83,6 +83,17 @@ def test_a_pretrained_policy_that_sees_spheres_says_so(task):
     agent = load_policy(path).agent(env.observation_size, env.action_size, True)
     obs = jnp.zeros(env.observation_size)
     assert agent(obs, jax.random.key(0)).shape == (env.action_size,)
+
+
+@pytest.mark.parametrize("arm", ["panda", "ur5e", "iiwa14"])
+@pytest.mark.parametrize("task", ["trajectory", "door", "push"])
+def test_a_pretrained_policy_of_another_arm_says_so_and_fits_every_arm(task, arm):
+    path = policies.find(str(FOLDER / f"{task}-rmp_vices-{arm}"))
+    options = load_config(path).task
+    assert (options.env, options.robot) == (task, arm)
+    widths = {load_policy(path).arrays["normalizer/mean"].shape}
+    jaco = policies.find(str(FOLDER / f"{task}-rmp_vices"))
+    assert widths == {load_policy(jaco).arrays["normalizer/mean"].shape}
 
 
 def test_a_pretrained_policy_says_what_it_was_measured_to_do():
