@@ -205,19 +205,22 @@ def _multipliers(dual: Dual, at_end: Float[Array, " m"]) -> Float[Array, " m"]:
     end = jnp.where(at_end > 0.0, dual.high, dual.low)
     over = jnp.where(held, dual.t - jnp.where(held, end, 0.0), 0.0)
     both = held[:, None] & held[None]
-    own = jnp.diag(jnp.where(held, dual.give, 1.0))
-    return _eliminate(jnp.where(both, dual.W, 0.0) + own, over)
+    own = jnp.where(held, dual.give, 1.0)
+    return _eliminate(jnp.where(both, dual.W, 0.0) + jnp.diag(own), over, own)
 
 
-def _eliminate(A: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Solve A x = b by Gauss-Jordan elimination, for A with a unit diagonal, PSD.
+def _eliminate(
+    A: Float[Array, "m m"], b: Float[Array, " m"], own: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """Solve A x = b by Gauss-Jordan elimination, for A - diag(own) PSD with entries of about 1.
 
-    As a loop it compiles faster than `psd_solve`. Few states come here.
+    No pivot is less than its entry of `own`, but for rounding. As a loop it compiles
+    faster than `psd_solve`. Few states come here.
     """
-    floor = len(b) * jnp.finfo(b.dtype).eps
+    least = jnp.maximum(own, len(b) * jnp.finfo(b.dtype).eps)
 
     def clear(k, rows):
-        row = rows[k] / jnp.maximum(rows[k, k], floor)
+        row = rows[k] / jnp.maximum(rows[k, k], least[k])
         rows = rows - rows[:, k][:, None] * row[None]
         return rows.at[k].set(row)
 
