@@ -212,7 +212,7 @@ def _multipliers(dual: Dual, at_end: Float[Array, " m"]) -> Float[Array, " m"]:
 def _eliminate(
     A: Float[Array, "m m"], b: Float[Array, " m"], own: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """Solve A x = b by Gauss-Jordan elimination, for A - diag(own) PSD with entries of about 1.
+    """Solve A x = b by Gauss-Jordan elimination, for A - diag(own) PSD.
 
     No pivot is less than its entry of `own`, but for rounding. As a loop it compiles
     faster than `psd_solve`. Few states come here.

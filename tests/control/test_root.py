@@ -1,5 +1,7 @@
 """The root under limits against Clarabel, and as a function that JAX transforms."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -150,6 +152,49 @@ def test_gradient_is_that_of_differences(hard_states):
             h = 1e-6
             slope = (tau(f, 1.0 + h, *rest) - tau(f, 1.0 - h, *rest)) / (2 * h)
             np.testing.assert_allclose(by_limit, slope, atol=1e-4 * np.max(tau_max))
+
+
+# fmt: off
+DEEP = [  # H and Mq of an iiwa 14 deep inside a box, their lower triangles by rows
+    466.2, 153.7, 223.4, -2.029, -4.921, 0.39, 0.02763, -0.2163, 0.001632, 0.2551,
+    0.01898, 0.01006, 0.01775, -0.009586, 0.003345, -0.03535, 0.02938, -0.02732,
+    -0.05263, 1.841e-10, 0.01625, -0.0008232, -0.0002535, -0.0003628, 0.0001451,
+    0.0008688, 4.37e-09, 0.001585,
+    2.526, 0.01564, 2.94, 1.27, 0.17, 0.9746, 0.09346, -0.7429, 0.002272, 0.9574,
+    -0.005031, 0.02085, 0.008102, -0.0262, 0.1132, -0.03733, 0.03128, -0.02892,
+    -0.05572, -3.837e-07, 0.1168, -0.0008911, -0.0002745, -0.0003928, 0.0001571,
+    0.0009405, 5.549e-09, 0.101,
+]
+# fmt: on
+
+
+def test_no_root_is_lost_in_float32_where_more_rows_hold_than_joints():
+    """Limits of torque and speed, on an arm that a box presses on: 4,000 like it.
+
+    A root that was lost is NaN, or accelerates by more than 1e8 rad/s^2. One in 80 was,
+    before the softness of a row bounded its pivot.
+    """
+    rng, count = np.random.default_rng(0), 4000
+    lower = np.zeros((2, N, N))
+    lower[:, *np.tril_indices(N)] = np.reshape(DEEP, (2, -1))
+    H, Mq = lower + np.tril(lower, -1).swapaxes(1, 2)
+    change = np.tril(1e-5 * rng.normal(size=(count, N, N)))
+    H = H * (1.0 + change + np.tril(change, -1).swapaxes(1, 2))
+    force = np.array([2.314e6, 1.96e6, -3.491e4, 5.477, -0.281, -0.0273, 0.00955])
+    f = force * np.exp(0.5 * rng.normal(size=(count, N)))
+    high = np.array([320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0])
+    bias = np.array([0.4217, -54.94, -2.766, 15.62, -0.5396, -0.2931, -0.0003693])
+    most = np.array([83.13, 77.74, 45.45, 54.2, 91.09, 77.03, 81.41])
+
+    @jax.jit(compiler_options=QUICK)
+    @functools.partial(jax.vmap, in_axes=(0, 0, None, None, None, None))
+    def root(H, f, Mq, low, high, most):
+        torque, speed = Rows.hard(Mq, low, high), Rows.soft(jnp.eye(N), -most, most)
+        return solve_root(H, f, Rows.join([torque, speed]))[0]
+
+    given = (H, f, Mq, -high - bias, high - bias, most)
+    qdd = np.asarray(root(*(jnp.asarray(x, jnp.float32) for x in given)))
+    assert np.all(np.abs(qdd) < 1e8)
 
 
 entries = st.lists(st.floats(-1.0, 1.0, width=32), min_size=30, max_size=30)
