@@ -192,6 +192,16 @@ def test_an_arm_without_pairs_or_obstacles_works_in_every_controller():
         assert out.diagnostics["usable"].dtype == jnp.float32
 
 
+def test_numbers_at_their_bounds_can_be_used(sampler):
+    """To the last bit: 10,000 of a joint and 1e9 s are in, the next numbers are not."""
+    fields = sampler.draw(np.random.default_rng(0), 1)
+    for name, most in (("q", 1e4), ("qd", -1e4), ("setpoint.time", 1e9)):
+        for value in (np.float32(most), np.nextafter(np.float32(most), np.inf * most)):
+            spoilt = {**fields, name: np.full_like(fields[name], value)}
+            one = jax.tree.map(lambda x: jnp.asarray(x[0]), sampler.tree(spoilt))
+            assert bool(judged(Inputs(**one))[1].all) == (value == most), name
+
+
 NAN = float("nan")
 UP = np.array([[0.0, 0.0, 1.0]])
 SLOTS: Any = Obstacles.empty(spheres=3, planes=1, capsules=1, boxes=1)
