@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.studies import faults
-from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, per_link
+from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, StopGuard, per_link
+from rmp_mjx.control import rmp_vices
 from rmp_mjx.control.fail_safe import BRAKING_TIME, Inputs, judged
+from rmp_mjx.rmp import RMP
 from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
@@ -121,6 +123,36 @@ def test_a_filter_that_knows_an_obstacle_by_half_solves_nothing(sampler, run):
         assert not found["usable"].any() and not found["solved"].any()
 
 
+class Lost(VICES):
+    """A controller that finds no torque."""
+
+    def unguarded(self, *args):
+        """All of it NaN."""
+        out = super().unguarded(*args)
+        return out.replace(tau=jnp.nan * out.tau)
+
+
+def test_a_torque_that_is_not_finite_makes_the_state_unusable_guarded_too(robot):
+    """The guard would brake in its place, and say nothing."""
+    q, none = jnp.array([0.1, 0.5, -0.3]), Obstacles.empty()
+    for guard in (None, StopGuard.of(robot)):
+        ctrl = Lost(robot, guard=guard)
+        setpoint = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
+        out = jax.jit(ctrl, compiler_options=QUICK)(q, q, setpoint, none)
+        assert out.diagnostics["usable"] == 0.0 and not out.qdd.any()
+        assert np.all(np.abs(out.tau) <= robot.tau_max) and out.tau.any()
+        assert not any(x.any() for x in out.diagnostics.values())
+
+
+def test_an_infinite_acceleration_gives_no_torque(robot, monkeypatch):
+    """Clipped to the limits it would have passed for one."""
+    lost = jnp.array([jnp.inf, 0.0, 0.0]), jnp.zeros(3)
+    monkeypatch.setattr(rmp_vices, "solve_root", lambda *args: lost)
+    eye, still = jnp.eye(3), jnp.zeros(3)
+    found = RMPVICES(robot).resolve(RMP(f=still, M=eye), eye, still, still)
+    assert np.isnan(found.tau[0])
+
+
 def test_gradients_are_finite_in_hostile_states():
     """By joints and set-point: zero where the torque does not depend on them.
 
@@ -158,6 +190,16 @@ def test_an_arm_without_pairs_or_obstacles_works_in_every_controller():
         out = jax.eval_shape(ctrl, q, q, setpoint, none)
         assert out.tau.shape == (3,)
         assert out.diagnostics["usable"].dtype == jnp.float32
+
+
+def test_numbers_at_their_bounds_can_be_used(sampler):
+    """To the last bit: 10,000 of a joint and 1e9 s are in, the next numbers are not."""
+    fields = sampler.draw(np.random.default_rng(0), 1)
+    for name, most in (("q", 1e4), ("qd", -1e4), ("setpoint.time", 1e9)):
+        for value in (np.float32(most), np.nextafter(np.float32(most), np.inf * most)):
+            spoilt = {**fields, name: np.full_like(fields[name], value)}
+            one = jax.tree.map(lambda x: jnp.asarray(x[0]), sampler.tree(spoilt))
+            assert bool(judged(Inputs(**one))[1].all) == (value == most), name
 
 
 NAN = float("nan")

@@ -169,35 +169,32 @@ DEEP = [  # H and Mq of an iiwa 14 deep inside a box, their lower triangles by r
 
 
 def test_no_root_is_lost_in_float32_where_more_rows_hold_than_joints():
-    """Limits of torque and speed, on an arm that a box presses on with 500 forces.
+    """Limits of torque and speed, on an arm that a box presses on: 4,000 like it.
 
-    A lost root is NaN. The torques keep their limits by 0.1 % in half of the states:
-    float32, and a condition of 1e6.
+    A root that was lost is NaN, or accelerates by more than 1e8 rad/s^2. One in 80 was,
+    before the softness of a row bounded its pivot.
     """
+    rng, count = np.random.default_rng(0), 4000
     lower = np.zeros((2, N, N))
     lower[:, *np.tril_indices(N)] = np.reshape(DEEP, (2, -1))
     H, Mq = lower + np.tril(lower, -1).swapaxes(1, 2)
+    change = np.tril(1e-5 * rng.normal(size=(count, N, N)))
+    H = H * (1.0 + change + np.tril(change, -1).swapaxes(1, 2))
+    force = np.array([2.314e6, 1.96e6, -3.491e4, 5.477, -0.281, -0.0273, 0.00955])
+    f = force * np.exp(0.5 * rng.normal(size=(count, N)))
     high = np.array([320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0])
-    bias = np.array([0.4, -55.0, -2.8, 15.6, -0.5, -0.3, 0.0])
-    most = np.full(N, 70.0)
-    force = np.array([2.3e6, 2e6, -3.5e4, 5.5, -0.3, 0.0, 0.0])
-    f = force * np.exp(0.5 * np.random.default_rng(0).normal(size=(500, N)))
+    bias = np.array([0.4217, -54.94, -2.766, 15.62, -0.5396, -0.2931, -0.0003693])
+    most = np.array([83.13, 77.74, 45.45, 54.2, 91.09, 77.03, 81.41])
 
     @jax.jit(compiler_options=QUICK)
-    @functools.partial(jax.vmap, in_axes=(0, None, None, None))
-    def root(f, H, Mq, ends):
-        low, high, most = ends
+    @functools.partial(jax.vmap, in_axes=(0, 0, None, None, None, None))
+    def root(H, f, Mq, low, high, most):
         torque, speed = Rows.hard(Mq, low, high), Rows.soft(jnp.eye(N), -most, most)
-        return solve_root(H, f, Rows.join([torque, speed]))
+        return solve_root(H, f, Rows.join([torque, speed]))[0]
 
-    given = (f, H, Mq, (-high - bias, high - bias, most))
-    qdd, at_end = jax.device_get(
-        root(*jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given))
-    )
-    assert np.isfinite(qdd).all()
-    tau = np.einsum("ij,kj->ki", Mq, qdd) + bias
-    assert np.median(np.max(np.abs(tau) / high, axis=1)) < 1.001
-    assert np.any(at_end != 0.0)
+    given = (H, f, Mq, -high - bias, high - bias, most)
+    qdd = np.asarray(root(*(jnp.asarray(x, jnp.float32) for x in given)))
+    assert np.all(np.abs(qdd) < 1e8)
 
 
 entries = st.lists(st.floats(-1.0, 1.0, width=32), min_size=30, max_size=30)
