@@ -236,6 +236,8 @@ def end(command, args):
 def attack(count, places, capsys, seed):
     """Run the command lines; how many ended with each code."""
     codes, before = {}, contents(places)
+    # As the interpreter opens it; pytest's own fails on names that no encoding has.
+    sys.stderr.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
     for command, args in lines(count, places, random.Random(seed)):
         shown = f"{command} {args}"[:300]
         try:

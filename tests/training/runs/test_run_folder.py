@@ -1,6 +1,7 @@
 """The folder of a run: who may write into it, and what `--overwrite` may delete."""
 
 import os
+import subprocess
 
 import pytest
 
@@ -122,3 +123,16 @@ def test_damaged_versions_are_refused_by_name(left, content):
     (left / "versions.json").write_text(content)
     with pytest.raises(ConfigError, match=r"versions\.json .*delete it to go on"):
         run_folder.changed_software(left)
+
+
+def test_an_installed_package_has_no_revision_of_the_repository_around_it(
+    tmp_path, monkeypatch
+):
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(tmp_path)]
+    for command in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "x"]):
+        subprocess.run([*git, *command], check=True)
+    for place, known in ((tmp_path, True), (tmp_path / "site-packages", False)):
+        file = place / "rmp_mjx" / "training" / "runs" / "run_folder.py"
+        file.parent.mkdir(parents=True)
+        monkeypatch.setattr(run_folder, "__file__", str(file))
+        assert (run_folder.software()["git"] != "unknown") == known
