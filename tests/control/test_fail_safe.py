@@ -126,9 +126,9 @@ def test_a_filter_that_knows_an_obstacle_by_half_solves_nothing(sampler, run):
 class Lost(VICES):
     """A controller that finds no torque."""
 
-    def unguarded(self, *args):
+    def unguarded(self, *args, **kwargs):
         """All of it NaN."""
-        out = super().unguarded(*args)
+        out = super().unguarded(*args, **kwargs)
         return out.replace(tau=jnp.nan * out.tau)
 
 
