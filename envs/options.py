@@ -202,7 +202,11 @@ class Options(Randomisation):
 
     def record(self) -> dict[str, Any]:
         """The options by name, `env` first, JSON-ready."""
-        return {"env": self.env, **dataclasses.asdict(self)}
+        values = dataclasses.asdict(self).items()
+        return {"env": self.env} | {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in values
+        }
 
 
 def substeps(sim_dt: float) -> int:

@@ -187,17 +187,21 @@ class World(Task[OptionsT]):
         radius, delay = self.options.sphere_radius, self.options.obstacle_delay
         return spheres.perceive(slots, data.mocap_pos, radius, error, delay)
 
-    def remember(self, q: Float[Array, " n"], rng: Array) -> ControlMemory:
+    def remember(
+        self, q: Float[Array, " n"], rng: Array | None = None
+    ) -> ControlMemory:
         """What is known of the control before an episode: the arm is held at rest.
 
         Args:
             q: Joint positions, (n,) [rad].
-            rng: Randomness of the motors.
+            rng: Randomness of the motors; None: they do as they are told.
         """
         contact = None if self.observer is None else self.observer.start(self.robot.n)
         arm = arm_state(self.robot, q, jnp.zeros_like(q))
         hold = self._applied(dynamics(self.robot, arm)[1])
-        motors = draw_motors(rng, self.options, hold, self.sim_dt)
+        motors = None
+        if rng is not None:
+            motors = draw_motors(rng, self.options, hold, self.sim_dt)
         limited = self.robot.tau_rate_max is not None
         return ControlMemory(contact, hold if limited else None, motors)
 
