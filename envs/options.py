@@ -45,6 +45,8 @@ _AT_LEAST_ZERO = (
     "observer_dead_band",
     "seen_spheres",
     "start_noise",
+    "position_noise",
+    "velocity_noise",
 )
 
 

@@ -57,7 +57,7 @@ class Randomisation:
         """Check the values.
 
         Raises:
-            ValueError: A range is none, or a value is negative.
+            ValueError: A range is none.
         """
         for name, usual in RANGES.items():
             value = getattr(self, name)
@@ -68,11 +68,6 @@ class Randomisation:
                 )
             if usual == _SAME and not value[0] > 0.0:
                 raise ValueError(f"{name} is a factor and must be positive, is {value}")
-        for name in ("position_noise", "velocity_noise"):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(
-                    f"{name} must be at least 0, got {getattr(self, name)}"
-                )
 
 
 RANGES: dict[str, Range] = {

@@ -20,6 +20,7 @@ import numpy as np
 import envs
 from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
 from benchmarks.studies import random_policies
+from benchmarks.studies.safety_study import ENDING
 from envs.arms import JACO
 from rmp_mjx import runtime
 from rmp_mjx.training.evaluation.evaluate import recorder
@@ -31,9 +32,6 @@ TRAINED = (JACO, "panda", "ur5e", "iiwa14")
 
 ARMS = (JACO, "panda", "fr3", "ur5e", "iiwa14")
 """Arms that are commanded."""
-
-EVENTS = ("collision", "self_collision", "joint_limit")
-"""Events that end an episode."""
 
 COUNTED = ("joint_velocity", "torque_rate")
 """Events of the motors, which do not."""
@@ -53,7 +51,7 @@ def under_random_policies(quick: bool) -> list[Row]:
             CONTROLLERS, random_policies.measure_all(args), strict=True
         ):
             value = {row.key: row for row in found}
-            for event in (*EVENTS, "joint_velocity"):
+            for event in (*ENDING, "joint_velocity"):
                 one = [
                     value[f"{name}_{policy}_{event}"]
                     for policy in random_policies.RANDOM
@@ -101,7 +99,7 @@ def judged(results: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Which episodes succeed, and in which something happens."""
     happened = {
         name: np.any([results[each] > 0 for each in group], axis=0)
-        for name, group in {"event": EVENTS, "motor": COUNTED}.items()
+        for name, group in {"event": ENDING, "motor": COUNTED}.items()
     }
     success = results["success"] > 0
     return {"success": success & ~happened["event"]} | happened

@@ -4,10 +4,11 @@ import numpy as np
 
 from benchmarks.common import Row
 from benchmarks.studies import arms
+from benchmarks.studies.safety_study import ENDING
 
 
 def results(**counts):
-    names = (*arms.EVENTS, *arms.COUNTED, "success")
+    names = (*ENDING, *arms.COUNTED, "success")
     return {name: np.array(counts.get(name, [0, 0, 0])) for name in names}
 
 
@@ -52,7 +53,7 @@ def test_random_events_are_summed_and_shown_from_vices_to_ours():
         Row(f"random/{arm}/{name}/{event}", value, "1/1000 steps", "")
         for arm in arms.ARMS
         for name, value in zip(arms.CONTROLLERS, (4.0, 0.0), strict=True)
-        for event in (*arms.EVENTS, "joint_velocity")
+        for event in (*ENDING, "joint_velocity")
     ]
     line = arms.random_table(rows).splitlines()[3]
     assert line == "| `panda` | 8 -> **0** | 4 -> **0** | 4 -> **0** |"
