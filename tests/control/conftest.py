@@ -16,6 +16,15 @@ QUICK = {"xla_backend_optimization_level": 0}
 """Compiles four times faster, for programs that a test runs only a few times."""
 
 
+def fresh(tree):
+    """The tree with copies of its NumPy arrays.
+
+    JAX 0.10 keeps the float32 copy of a float64 array that a program has as a constant,
+    and gives that one to programs in float64 as well ("expected f64, got f32").
+    """
+    return jax.tree.map(lambda x: x.copy() if isinstance(x, np.ndarray) else x, tree)
+
+
 def changed(tree, **fields):
     """A tree with other fields of any type: batches, or what a caller gets wrong."""
     tree = copy.copy(tree)
@@ -39,7 +48,7 @@ def run64():
 
     def run(*args):
         with jax.enable_x64(True):
-            return jax.device_get(controlled(*args))
+            return jax.device_get(controlled(*fresh(args)))
 
     return run
 

@@ -22,7 +22,7 @@ from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, point_positions, site_state
-from tests.control.conftest import QUICK
+from tests.control.conftest import QUICK, fresh
 
 quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
 
@@ -96,10 +96,7 @@ def test_closed_form_is_the_autodiff_tree_in_contact(run64, robot, inputs, push)
 
 
 def test_the_closed_form_evaluates_no_task_map(monkeypatch, ctrl, robot, inputs):
-    """So the tests above compare two programs, not one with itself.
-
-    In float32: of a trace that fails JAX keeps the constants' types for other tests.
-    """
+    """So the tests above compare two programs, not one with itself."""
 
     def refuse(*args):
         raise AssertionError("a task map is evaluated")
@@ -108,9 +105,9 @@ def test_the_closed_form_evaluates_no_task_map(monkeypatch, ctrl, robot, inputs)
     q, qd, action, obstacles = jax.tree.map(lambda x: x[0], inputs)
     setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
     args = q, qd, setpoint, obstacles
-    jax.eval_shape(ctrl, *args)
+    jax.eval_shape(fresh(ctrl), *args)
     with pytest.raises(AssertionError, match="a task map is evaluated"):
-        jax.eval_shape(Definition(robot), *args)
+        jax.eval_shape(fresh(Definition(robot)), *args)
 
 
 def with_weights(inputs, entries):
