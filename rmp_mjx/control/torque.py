@@ -65,6 +65,10 @@ def stop_time(
 HORIZON = 5
 """Periods in which a joint may come to its greatest speed."""
 
+ROOM = 0.01
+"""Share of the greatest speed that is left free: within a period the inertia changes,
+and joints were up to 0.3 % faster than planned."""
+
 
 def speed_range(
     qd_max: Float[Constant, " n"],
@@ -75,7 +79,7 @@ def speed_range(
     """The accelerations that keep the joints within their speeds.
 
     Args:
-        qd_max: Greatest speeds, (n,) [rad/s].
+        qd_max: Greatest speeds, (n,) [rad/s]. `ROOM` of them is left free.
         qd: Joint velocities, (n,) [rad/s].
         w: Joint acceleration by contacts, (n,) [rad/s^2]; None: nothing touches.
         period: Control period [s]. The rest of the way to the greatest speed takes
@@ -84,7 +88,7 @@ def speed_range(
     Returns:
         Lowest and highest acceleration, (n,) each [rad/s^2].
     """
-    limit = jnp.asarray(qd_max, qd.dtype)
+    limit = (1.0 - ROOM) * jnp.asarray(qd_max, qd.dtype)
     other = jnp.zeros_like(qd) if w is None else w
     time = HORIZON * period
     return (-limit - qd) / time - other, (limit - qd) / time - other

@@ -230,7 +230,7 @@ def quick_arm(robot):
 
 
 def test_joints_are_held_below_their_speed(run64, quick_arm, states, obstacles):
-    """qd + 5 periods x qdd within the speed, where the torque limits allow it.
+    """qd + 5 periods x qdd within 99 % of the speed, where the torque limits allow it.
 
     The limits of speed are soft: in 90 % of the states 5 % of what the free solution
     exceeds them by, 50 % at most. Arms that touch an obstacle are left out.
@@ -243,9 +243,9 @@ def test_joints_are_held_below_their_speed(run64, quick_arm, states, obstacles):
     torque, speed = (out.diagnostics[f"{x}_limit"] for x in ("torque", "velocity"))
     can = ~torque.any(axis=1) & (out.diagnostics["clearance"] > 0.01)
     assert can.sum() > 100
-    beyond = np.abs(after).max(axis=1) - 0.5
+    beyond = np.abs(after).max(axis=1) - 0.99 * 0.5
     free = np.linalg.solve(out.M + ctrl.regularizer * out.Mq, out.f[..., None])[..., 0]
-    wanted = np.abs(qd + 5 * ctrl.period * free).max(axis=1) - 0.5
+    wanted = np.abs(qd + 5 * ctrl.period * free).max(axis=1) - 0.99 * 0.5
     share = beyond[can] / (1e-3 + np.maximum(wanted[can], 0.0))
     assert np.quantile(share, 0.9) < 0.05 and share.max() < 0.5
     assert (speed != 0.0).any(axis=1).mean() > 0.2
