@@ -202,15 +202,15 @@ class Checkpointer:
                 manifest[name] = _describe(path, array)
         content = {"arrays": manifest, "run": self._run_id, "step": step}
         try:
-            self._manager.save(
-                step,
-                args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(arrays),
-                    manifest=ocp.args.JsonSave(content | {"sha256": _digest(content)}),
-                ),
-                metrics=dict(merit) if merit else None,
+            parts = ocp.args.Composite(
+                state=ocp.args.StandardSave(arrays),
+                manifest=ocp.args.JsonSave(content | {"sha256": _digest(content)}),
             )
-            self._manager.wait_until_finished()
+            with _quiet():
+                self._manager.save(
+                    step, args=parts, metrics=dict(merit) if merit else None
+                )
+                self._manager.wait_until_finished()
             own = self._folder / str(step)
             write_text(own / SUMS, json.dumps(_sums(own)))
         except Exception as error:  # Orbax's errors share no base class

@@ -94,6 +94,8 @@ class Saver:
         self.last = last
         self._checkpoints = checkpoints
         self._folder = folder
+        self._lock = folder / run_folder.LOCK
+        self._owned = _identity(self._lock)
         self._note = note
         self._commands = commands
         self._failed = False
@@ -122,12 +124,15 @@ class Saver:
             final: Whether this is the last save.
 
         Raises:
-            TrainingFailure: It failed twice in a row, or at the last save.
+            TrainingFailure: It failed twice in a row, or at the last save; or the
+                run's folder is gone.
         """
+        self._check_folder(iteration)
         try:
             if self._checkpoints:
                 self._checkpoints.save(iteration, state, self._merit())
         except SaveError as error:
+            self._check_folder(iteration)
             problem = f"{error} ({_room(self._folder)})"
             if final or self._failed:
                 raise TrainingFailure(
@@ -140,12 +145,32 @@ class Saver:
         self.last, self._failed = iteration, False
         self._episodes, self._sums = 0, dict.fromkeys(MERITS, 0.0)
 
+    def _check_folder(self, iteration: int) -> None:
+        """Raise TrainingFailure if the run's folder is not the one it began with."""
+        if _identity(self._lock) != self._owned:
+            raise TrainingFailure(
+                f"iteration {iteration} is not saved: {self._folder} was removed or "
+                "replaced while this run was writing to it"
+            )
+
     def how_to_continue(self) -> str:
         """What is saved, and the command that continues from there."""
         if not self.last:
             return "nothing is saved yet"
         command = then("continue with", self._commands.resume, self._folder)
         return f"saved is iteration {self.last}{command}"
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Device and inode of a file; None: there is none.
+
+    Who holds a lock has the file open: no other file can have its inode.
+    """
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _room(folder: Path) -> str:

@@ -1,21 +1,27 @@
 """Processes that tests start: `python -m tests.training.runs.processes ROLE ...`.
 
-`victim FOLDER [resume]` says on standard output what it is doing, line by line, until
-somebody kills it. `member JSON` trains the counting toy together with others.
+`victim FOLDER [resume] [jumping]` says on standard output what it is doing, line by
+line, until somebody kills it; `jumping`: its clock is wrong by up to a day, each time
+otherwise. `member JSON` trains the counting toy together with others.
 """
 
+import functools
 import json
+import random
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from rmp_mjx import runtime
+from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import distributed
 from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.runs.checkpoint import Checkpointer
 from rmp_mjx.training.runs.logging import RunLogger
+from rmp_mjx.training.runs.saving import TrainingFailure
 from tests.training import toys
 from tests.training.conftest import SMALL, run, small
 
@@ -55,12 +61,26 @@ def speak() -> None:
     train_module._start = spoken_start
 
 
-def victim(folder: str, *resume: str) -> int:
+def jump() -> None:
+    """From now on the wall clock is wrong by up to a day either way at every look."""
+    real, real_ns = time.time, time.time_ns
+    error = functools.partial(random.uniform, -86400.0, 86400.0)
+    time.time = lambda: real() + error()
+    time.time_ns = lambda: real_ns() + int(1e9 * error())
+
+
+def victim(folder: str, *how: str) -> int:
     """Train, and say aloud what is done, until somebody kills the process."""
     runtime.configure()
     speak()
-    place = {"run_dir": None, "resume": folder} if resume else {}
-    result, _ = run(Path(folder), **{**OPTIONS, **place})
+    if "jumping" in how:
+        jump()
+    place = {"run_dir": None, "resume": folder} if "resume" in how else {}
+    try:
+        result, _ = run(Path(folder), **{**OPTIONS, **place})
+    except (ConfigError, TrainingFailure) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2 if isinstance(error, ConfigError) else 1
     return result.exit_code
 
 

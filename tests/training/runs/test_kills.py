@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -42,7 +43,8 @@ def rows(folder):
 class Victim:
     """A training process; its lines can be waited for."""
 
-    def __init__(self, root, folder, *resume):
+    def __init__(self, root, folder, *how):
+        self.root, self.folder = root, folder
         self.heard: list[tuple[str, int]] = []
         self._process = subprocess.Popen(
             [
@@ -51,7 +53,7 @@ class Victim:
                 "tests.training.runs.processes",
                 "victim",
                 str(folder),
-                *resume,
+                *how,
             ],
             cwd=root,
             stdout=subprocess.PIPE,
@@ -86,12 +88,34 @@ class Victim:
         return self._process.returncode, err
 
 
-def kill_and_resume(root, folder, reference, kills, chance):
-    """Kill the same run again and again; how many kills fell into a save."""
+def kill(process, chance):
+    """SIGKILL."""
+    process.send(signal.SIGKILL)
+    assert process.end()[0] == -signal.SIGKILL
+
+
+def terminate_twice(process, chance):
+    """SIGTERM, and again within 0.1 s: the end of the process, orderly or not."""
+    process.send(signal.SIGTERM)
+    time.sleep(chance.uniform(0.0, 0.1))
+    process.send(signal.SIGTERM)
+    assert process.end()[0] in (-signal.SIGTERM, 128 + signal.SIGTERM)
+
+
+def intrude(process, chance):
+    """A second process is refused as long as the first lives; then SIGKILL for it."""
+    process.send(signal.SIGSTOP)
+    code, error = Victim(process.root, process.folder, "resume").end()
+    assert (code, error.count("is in use by process")) == (2, 1), error
+    kill(process, chance)
+
+
+def kill_and_resume(root, folder, reference, kills, chance, strike=kill, how=()):
+    """Strike the same run again and again; how many strikes fell into a save."""
     config, state, table = reference
     acknowledged, resume, saving = 0, [], 0
     for _ in range(kills):
-        process = Victim(root, folder, *resume)
+        process = Victim(root, folder, *resume, *how)
         assert process.wait_for("starting"), process.end()
         # never less than what a process before has reported as saved
         assert process.last("starting") >= acknowledged
@@ -99,11 +123,10 @@ def kill_and_resume(root, folder, reference, kills, chance):
         target = process.last("starting") + chance.randint(3, 7)
         assert process.wait_for(within, target), process.end()
         time.sleep(chance.uniform(0.0, LONGEST_SAVE))
-        process.send(signal.SIGKILL)
-        assert process.end()[0] == -signal.SIGKILL
+        strike(process, chance)
         saving += process.last("saving") > process.last("saved")
         acknowledged, resume = max(acknowledged, process.last("saved")), ["resume"]
-    process = Victim(root, folder, *resume)
+    process = Victim(root, folder, *resume, *how)
     code, error = process.end()
     assert code == 0, error
     assert process.last("starting") >= acknowledged
@@ -118,6 +141,45 @@ def test_a_run_killed_twice_ends_as_if_nothing_had_happened(root, reference, tmp
     kill_and_resume(root, tmp_path / "run", reference, 2, random.Random(0))
 
 
+@pytest.mark.parametrize(
+    ("strike", "how"),
+    [(terminate_twice, ()), (intrude, ()), (kill, ("jumping",))],
+    ids=["terminated twice", "with a second process", "with a clock that jumps"],
+)
+@pytest.mark.faults
+@pytest.mark.slow
+def test_twenty_strikes_of_other_kinds_lose_nothing_either(
+    root, reference, tmp_path, strike, how
+):
+    for k in range(4):
+        folder, chance = tmp_path / str(k), random.Random(k)
+        kill_and_resume(root, folder, reference, 5, chance, strike, how)
+
+
+def removed(root, folder, chance):
+    """A process whose run's folder is deleted; its exit code and errors."""
+    process = Victim(root, folder)
+    within = chance.choice(("saving", "iteration"))
+    assert process.wait_for(within, chance.randint(3, 7)), process.end()
+    time.sleep(chance.uniform(0.0, LONGEST_SAVE))
+    shutil.rmtree(folder, ignore_errors=True)
+    return process.end()
+
+
+def test_a_run_whose_folder_is_removed_stops_and_says_so(root, tmp_path):
+    code, error = removed(root, tmp_path / "run", random.Random(0))
+    assert code == 1 and "was removed or replaced while" in error
+
+
+@pytest.mark.faults
+@pytest.mark.slow
+def test_twenty_runs_whose_folder_is_removed_stop_and_say_so(root, tmp_path):
+    for k in range(20):
+        code, error = removed(root, tmp_path / str(k), random.Random(k))
+        assert code == 1 and "was removed or replaced while" in error
+
+
+@pytest.mark.faults
 @pytest.mark.slow
 def test_a_run_killed_twenty_times_ends_as_if_nothing_had_happened(
     root, reference, tmp_path, capsys
