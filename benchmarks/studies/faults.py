@@ -18,6 +18,7 @@ import numpy as np
 
 import rmp_mjx as rmp
 from benchmarks.common import Row, show, write_json
+from benchmarks.studies.chains import random_chain
 from rmp_mjx import runtime
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.controller import ImpedanceController
@@ -47,22 +48,6 @@ def controllers(robot: rmp.Robot) -> dict[str, ImpedanceController]:
         "rmp_vices_guarded": rmp.RMPVICES(robot, guard=guard),
         "vices_guarded": rmp.VICES(robot, guard=guard),
     }
-
-
-def random_arm(seed: int, joints: int = 4) -> rmp.Robot:
-    """A chain of capsules of random lengths and axes; the first joint has no limits."""
-    rng = np.random.default_rng(seed)
-    body, motors = '<site name="tip" pos="0 0 .1"/>', ""
-    for j in reversed(range(joints)):
-        x, y, z = rng.normal(size=3)
-        length, limits = rng.uniform(0.1, 0.3), 'range="-2 2"' if j else ""
-        body = f"""<body pos="0 0 {length if j else 0.1}">
-        <joint name="j{j}" axis="{x} {y} {z}" {limits} armature=".01"/>
-        <geom type="capsule" fromto="0 0 0 0 0 {length}" size=".03"/>{body}</body>"""
-        motors += f'<motor name="m{j}" joint="j{j}" ctrlrange="-20 20"/>'
-    text = f"""<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody>
-    <actuator>{motors}</actuator></mujoco>"""
-    return rmp.Robot.from_mjcf(text, site="tip", spacing=0.05)
 
 
 class Sampler:
@@ -258,7 +243,7 @@ def compiled(ctrl: ImpedanceController, **options: Any) -> Callable[..., Any]:
 def arms(seed: int) -> dict[str, rmp.Robot]:
     """Every arm that ships, and a random one."""
     shipped = {name: rmp.Robot.load(name) for name in SHIPPED}
-    return shipped | {"random": random_arm(seed)}
+    return shipped | {"random": random_chain(seed)}
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rmp_mjx import sim
-from rmp_mjx.control import RMPVICES
+from rmp_mjx.control import RMPVICES, Controller
 from rmp_mjx.math import log_so3
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Pytree
@@ -137,11 +138,19 @@ def draw_reaches(robot: Robot, count: int, seed: int = 0) -> Draws:
     return Draws(goal[chosen], rotation[chosen], sphere, blocked, radius)
 
 
-def run_reaches(robot: Robot, draws: Draws) -> Track:
-    """Simulate all reaches with the default controller; entries lead with the reach."""
+def run_reaches(
+    robot: Robot, draws: Draws, make: Callable[..., Controller] = RMPVICES
+) -> Track:
+    """Simulate all reaches; entries lead with the reach.
+
+    Args:
+        robot: The arm.
+        draws: What is to be reached.
+        make: The controller, `make(robot, period=)`.
+    """
     model = _scene(robot, draws.radius)
     physics = sim.load_physics("mujoco", model)
-    ctrl = RMPVICES(robot, period=PERIOD)
+    ctrl = make(robot, period=PERIOD)
     spheres = len(set(robot.capsules.geom))
     step = 0.06 * reach_of(robot)
     steps = int(DURATION / PERIOD) // HOLD

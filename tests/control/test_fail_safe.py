@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.studies import faults
+from benchmarks.studies.chains import random_chain
 from rmp_mjx import RMPVICES, VICES, Obstacles, Robot, StopGuard, per_link
 from rmp_mjx.control import rmp_vices
 from rmp_mjx.control.fail_safe import BRAKING_TIME, Inputs, judged
@@ -24,7 +25,7 @@ BATCH = 512
 
 @pytest.fixture(scope="module")
 def robot():
-    return faults.random_arm(0, joints=3)
+    return random_chain(1, joints=3)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +147,7 @@ def test_a_torque_that_is_not_finite_makes_the_state_unusable_guarded_too(robot)
 
 def test_an_infinite_acceleration_gives_no_torque(robot, monkeypatch):
     """Clipped to the limits it would have passed for one."""
-    lost = jnp.array([jnp.inf, 0.0, 0.0]), jnp.zeros(3)
+    lost = jnp.array([jnp.inf, 0.0, 0.0]), jnp.zeros(6)
     monkeypatch.setattr(rmp_vices, "solve_root", lambda *args: lost)
     eye, still = jnp.eye(3), jnp.zeros(3)
     found = RMPVICES(robot).resolve(RMP(f=still, M=eye), eye, still, still)
@@ -158,7 +159,7 @@ def test_gradients_are_finite_in_hostile_states():
 
     With six joints or more: VICES inverts the whole operational inertia.
     """
-    arm = faults.random_arm(0, joints=7)
+    arm = random_chain(0, joints=7)
     ctrl, sampler = VICES(arm), faults.Sampler(arm)
 
     @jax.jit(compiler_options=QUICK)
