@@ -60,6 +60,8 @@ test-slow: $(STAMP)
 # Hostile input in numbers; prints the figures of docs/reliability.md.
 faults: $(STAMP)
 	$(PY) -m pytest -m faults $(ARGS)
+	$(PY) -m benchmarks.faults
+	$(PY) -m benchmarks.soak
 
 # Do the tests see small changes of the code? A random sample of them: half an hour for
 # --sample 60. Goes on where it was interrupted.
