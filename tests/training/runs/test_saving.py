@@ -159,7 +159,8 @@ try:
     text.write(f"finished {result.iterations}")
 except TrainingFailure as failure:
     text.write(f"stopped: {failure}")
-kept = sorted((path.name for path in (disk / "run/checkpoints").iterdir()), key=int)
+names = [path.name for path in (disk / "run/checkpoints").iterdir()]
+kept = sorted((name for name in names if name.isdecimal()), key=int)
 sys.stdout.write(f"{text.getvalue()}\\nkept {' '.join(kept)}")
 """
 
