@@ -25,6 +25,7 @@ from benchmarks.common import (
     show,
     write_json,
 )
+from envs.arms import JACO
 from rmp_mjx import runtime
 
 SPHERES = 5
@@ -37,6 +38,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="a smoke test: few calls")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random states")
+    parser.add_argument("--robot", default=JACO, help="arm, by name or path")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args(argv)
 
@@ -121,9 +123,11 @@ def latency(ctrl: rmp.RMPVICES | rmp.VICES, seed: int, calls: int) -> list[Row]:
     ]
 
 
-def measure_all(quick: bool, seed: int, *, autodiff: bool = True) -> list[Row]:
-    """Every row of one process."""
-    robot = rmp.Robot.load("jaco2")
+def measure_all(
+    name: str, quick: bool, seed: int, *, autodiff: bool = True
+) -> list[Row]:
+    """Every row of one process, for the arm of this name."""
+    robot = rmp.Robot.load(name)
     batch, seconds, calls = (256, 0.5, 200) if quick else (BATCH, 10.0, 20_000)
     guard = rmp.StopGuard.of(robot)
     named = [
@@ -153,15 +157,16 @@ def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write the requested files."""
     args = parse(argv)
     runtime.configure(cpu_flags=not args.worker, split_cpu=True, compile_cache=False)
-    rows = measure_all(args.quick, args.seed, autodiff=not args.worker)
+    rows = measure_all(args.robot, args.quick, args.seed, autodiff=not args.worker)
     if args.worker:
         print(json.dumps([asdict(row) for row in rows]))
         return
-    options = ["--seed", str(args.seed), *(["--quick"] if args.quick else [])]
+    options = ["--robot", args.robot, "--seed", str(args.seed)]
+    options += ["--quick"] * args.quick
     rows += rows_with_default_flags("benchmarks.speed.bench_controller", options)
     show(rows, "Controller")
     if args.json:
-        sizes = {"robot": "jaco2", "spheres": SPHERES, "quick": args.quick}
+        sizes = {"robot": args.robot, "spheres": SPHERES, "quick": args.quick}
         write_json(args.json, rows, seed=args.seed, **sizes)
 
 

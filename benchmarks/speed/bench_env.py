@@ -13,6 +13,7 @@ import jax
 
 import envs
 from benchmarks.common import Row, measure, on_all_devices, show, write_json
+from envs.arms import JACO
 from rmp_mjx import runtime
 
 ENGINES = ("mujoco", "mjx")
@@ -34,6 +35,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         action="append",
         help="measure only this physics engine; may be repeated (default: all)",
     )
+    parser.add_argument("--robot", default=JACO, help="arm, by name or path")
     parser.add_argument("--num_envs", type=int, nargs="+", default=SIZES)
     parser.add_argument(
         "--seconds", type=float, default=10.0, help="time for each size"
@@ -42,17 +44,18 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def measure_engine(
-    engine: str, sizes: tuple[int, ...], seed: int, seconds: float
+    engine: str, robot: str, sizes: tuple[int, ...], seed: int, seconds: float
 ) -> list[Row]:
     """Rows of one engine.
 
     Args:
         engine: Physics engine.
+        robot: Arm.
         sizes: Numbers of environments.
         seed: Of start states and actions.
         seconds: Time to spend on each size. [s]
     """
-    env = envs.load("trajectory", controller="rmp_vices", physics=engine)
+    env = envs.load("trajectory", controller="rmp_vices", physics=engine, robot=robot)
     reset = jax.jit(jax.vmap(env.reset))
     substeps = f"{env.n_substeps} x {env.sim_dt * 1e3:g} ms"
     rows = []
@@ -114,10 +117,15 @@ def main(argv: list[str] | None = None) -> None:
     sizes_text = ", ".join(map(str, sizes))
     rows = []
     for engine in args.engine or ENGINES:
-        rows += measure_engine(engine, sizes, args.seed, seconds)
+        rows += measure_engine(engine, args.robot, sizes, args.seed, seconds)
         if args.json:  # after each engine: nothing is lost if the next one is stopped
             write_json(
-                args.json, rows, seed=args.seed, num_envs=sizes_text, quick=args.quick
+                args.json,
+                rows,
+                robot=args.robot,
+                seed=args.seed,
+                num_envs=sizes_text,
+                quick=args.quick,
             )
     show(rows, "Trajectory task, RMP-VICES")
 

@@ -22,6 +22,7 @@ from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
 from benchmarks.studies.failures import share
 from benchmarks.studies.random_policies import Clipped
 from benchmarks.studies.safety_study import ENDING, Group, Study
+from envs.arms import JACO
 from envs.cli import load_config
 from rmp_mjx import RMPVICES, runtime
 from rmp_mjx.training.policy import load_policy
@@ -166,22 +167,22 @@ def measure(
     lines: list[str],
     episodes: int,
     seed: int,
-    observer: str,
+    options: Mapping[str, Any],
 ) -> list[Row]:
-    """All cells of one task under one policy."""
+    """All cells of one task under one policy; `options` are the task's."""
     policy, config = load_policy(path), load_config(path)
     programs: dict[str, list[str]] = {}
     for name in worlds:
         programs.setdefault(str(WORLDS[name].options), []).append(name)
     rows = []
     for names in programs.values():
-        options: dict[str, Any] = {
+        own: dict[str, Any] = {
             "layout": "close",
             "physics": "mujoco",
-            "observer": observer,
             "seen_spheres": config.task.seen_spheres,
-        } | WORLDS[names[0]].options
-        sample = envs.load(task, **options)
+        }
+        own |= {**options, **WORLDS[names[0]].options}
+        sample = envs.load(task, **own)
         agent = policy.agent(sample.observation_size, sample.action_size, True)
         groups = {
             name: Group("trained", episodes, limit=sample.episode_length, **more)
@@ -197,7 +198,7 @@ def measure(
                 task=task,
                 agent=agent,
                 restart=False,
-                **options | more,
+                **own | more,
             )
             for line in kinds:
                 made = study.env.controller
@@ -255,11 +256,16 @@ def cause_table(task: str, worlds: list[str], rows: list[Row]) -> str:
 def parse(argv: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", nargs="+", default=list(envs.names()))
-    parser.add_argument("--worlds", nargs="+", default=list(WORLDS))
-    parser.add_argument("--lines", nargs="+", default=list(PARTS | OTHERS))
+    for option, known in (
+        ("--tasks", envs.names()),
+        ("--worlds", WORLDS),
+        ("--lines", PARTS | OTHERS),
+    ):
+        names = list(known)
+        parser.add_argument(option, nargs="+", choices=names, default=names)
     parser.add_argument("--policies", type=Path, default=ROOT / "pretrained")
     parser.add_argument("--suffix", default="rmp_vices", help="TASK-SUFFIX.safetensors")
+    parser.add_argument("--robot", default=JACO, help="arm, by name or path")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=4000)
     parser.add_argument("--observer", default="momentum")
@@ -284,7 +290,7 @@ def main(argv: list[str] | None = None) -> None:
             args.lines,
             args.episodes,
             args.seed,
-            args.observer,
+            {"observer": args.observer, "robot": args.robot},
         )
         show(rows, task)
         if args.json:
