@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from rmp_mjx.files import with_tuples
 from rmp_mjx.names import unknown
 from rmp_mjx.robot import Robot
 
@@ -43,11 +44,7 @@ def make_options(env: str, **options: Any) -> Options:
     for name in options:
         if name not in valid:
             raise ValueError(unknown(f"option of '{env}'", name, valid))
-    values: dict[str, Any] = {  # JSON gives back lists for tuples
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in options.items()
-    }
-    return kind(**values)
+    return kind(**with_tuples(options))
 
 
 def recorded(record: Mapping[str, Any]) -> Options:

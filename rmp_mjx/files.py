@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -50,3 +50,11 @@ def read_json(path: Path) -> Any:
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ValueError(f"{path} cannot be read: {reason}") from error
+
+
+def with_tuples(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record with tuples again where JSON gave back lists."""
+    return {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in record.items()
+    }

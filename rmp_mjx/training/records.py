@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rmp_mjx.files import read_json, write_text
+from rmp_mjx.files import read_json, with_tuples, write_text
 from rmp_mjx.training.config import (
     AnyTask,
     ConfigError,
@@ -93,14 +93,10 @@ def config_of(
     if not all(isinstance(part, dict) for part in parts):
         raise ConfigError("task, ppo and run must be JSON objects")
     options, ppo, run = parts
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in ppo.items()
-    }
     trainer: Any = record.get("trainer", "ours")
     try:
         return TrainConfig(
-            task(options), PPOConfig(**values), RunConfig(**run), trainer
+            task(options), PPOConfig(**with_tuples(ppo)), RunConfig(**run), trainer
         )
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
