@@ -68,6 +68,11 @@ class FrankaBackend:
         self._control = None
         self.robot.automatic_error_recovery()
 
+    def look(self) -> tuple[np.ndarray, np.ndarray]:
+        """The state while nobody controls the robot."""
+        state = self.robot.read_once()
+        return np.array(state.q), np.array(state.dq)
+
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """The robot's next state; the first call starts torque control.
 
@@ -79,12 +84,20 @@ class FrankaBackend:
                 [TORQUE] * JOINTS, [TORQUE] * JOINTS, [FORCE] * 6, [FORCE] * 6
             )
             self._control = self.robot.start_torque_control()
-        state, _ = self._control.readOnce()
+        try:
+            state, _ = self._control.readOnce()
+        except Exception:
+            self._control = None
+            raise
         return np.array(state.q), np.array(state.dq)
 
     def write(self, tau: np.ndarray) -> None:
         """Send torques without gravity, (7,) [N m]."""
-        self._control.writeOnce(self._franka.Torques(tau.tolist()))
+        try:
+            self._control.writeOnce(self._franka.Torques(tau.tolist()))
+        except Exception:
+            self._control = None
+            raise
 
     def finish(self, tau: np.ndarray) -> None:
         """Send the last torques, and give the arm back to the robot."""

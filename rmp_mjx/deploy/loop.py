@@ -14,7 +14,7 @@ import numpy as np
 from rmp_mjx.deploy.backends import Backend
 from rmp_mjx.deploy.deployed import Deployed
 from rmp_mjx.deploy.log import RingLog, check_writable
-from rmp_mjx.deploy.pilot import PHASES, Pilot
+from rmp_mjx.deploy.pilot import PHASES, RATE, Pilot
 from rmp_mjx.deploy.sources import ObstacleSource
 from rmp_mjx.deploy.targets import Targets
 from rmp_mjx.deploy.watchdog import Watchdog
@@ -82,6 +82,7 @@ class Loop:
         watchdog: Watchdog | None = None,
         log: str | Path | None = None,
         keep: float = 60.0,
+        rate: float = RATE,
     ):
         """Compile it.
 
@@ -93,6 +94,8 @@ class Loop:
             watchdog: Bounds; default the usual ones.
             log: Parquet file to write at the end.
             keep: Time that the log keeps [s].
+            rate: Share of the torque rate's limit that is sent. A robot at the end of a
+                network may take two torques in one of its ticks, so less than half.
 
         Raises:
             ImportError: There is to be a log, and polars is not installed.
@@ -103,7 +106,7 @@ class Loop:
             obstacles = ObstacleSource(deployed.obstacles())
             watchdog = watchdog or Watchdog(stale=None)
         self.deployed, self.backend = deployed, backend
-        self.pilot = Pilot(deployed, obstacles, targets, watchdog)
+        self.pilot = Pilot(deployed, obstacles, targets, watchdog, rate)
         self._path = None if log is None else Path(log)
         self.log = RingLog(deployed.n, round(keep / deployed.period))
         self._stop = threading.Event()
@@ -196,13 +199,14 @@ class Loop:
         """How it went so far."""
         ticks, limits = self.log.columns(), self.deployed.limits
         slopes = np.abs(np.diff(ticks["tau"], axis=0)) / self.deployed.period
+        met = ticks["work"] < self.deployed.period
         return Report(
             reason=self.pilot.reason,
             held=self.pilot.phase == "held",
             ticks=self.log.count,
             interval=Timing.of(ticks["interval"][1:]),
             work=Timing.of(ticks["work"]),
-            on_time=float(np.mean(ticks["work"] < self.deployed.period)),
+            on_time=float(np.mean(met)) if len(met) else 1.0,
             torque=_most(ticks["tau"] / limits.tau),
             torque_rate=_most(slopes / limits.tau_rate),
             speed=_most(ticks["qd"] / limits.qd),

@@ -27,7 +27,7 @@ BRAKING = 1.0
 HOLD = 25.0
 """Stiffness that holds an arm at rest in its place [1/s^2]."""
 RATE = 0.9
-"""Share of the torque rate's limit that is sent."""
+"""Share of the torque rate's limit that is sent, if not else said."""
 
 
 class Pilot:
@@ -39,6 +39,7 @@ class Pilot:
         obstacles: ObstacleSource,
         targets: Targets,
         watchdog: Watchdog | None = None,
+        rate: float = RATE,
     ):
         """Compile the controller.
 
@@ -47,6 +48,7 @@ class Pilot:
             obstacles: Where the obstacles come from.
             targets: Where the set-points come from.
             watchdog: Bounds; default the usual ones.
+            rate: Share of the torque rate's limit that is sent.
         """
         self.deployed, self.limits = deployed, deployed.limits
         self.obstacles, self.targets = obstacles, targets
@@ -59,7 +61,7 @@ class Pilot:
         self.gravity = np.zeros(deployed.n)
         self.out: dict[str, Any] = {}
         self.age = 0.0
-        self._number = -1
+        self._number, self._rate = -1, rate
         self._q = self._qd = self._q_held = np.zeros(deployed.n)
 
     @property
@@ -191,7 +193,7 @@ class Pilot:
 
     def _sent(self, tau: np.ndarray) -> np.ndarray:
         """The torque within the arm's limits and their rate, and remember it."""
-        step = RATE * self.limits.tau_rate * self.deployed.period
+        step = self._rate * self.limits.tau_rate * self.deployed.period
         tau = np.clip(tau, self.tau - step, self.tau + step)
         self.tau = np.clip(tau, -self.limits.tau, self.limits.tau)
         return self.tau
