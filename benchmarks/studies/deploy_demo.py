@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -35,9 +36,11 @@ ADDRESS = "127.0.0.1"
 AT = ADDRESS, 1337
 RATE = 0.45
 """Share of the torque rate's limit: two torques in one tick of the robot are within."""
+ATTEMPTS = 5
+"""An episode is begun anew so often, where the robot stops itself or a tick is late."""
 OVER = np.array([0.05, 0.0, 0.1])
 """Spheres may be so far beyond the via points' box [m]."""
-TABLE = {"point": [[0.0, 0.0, -0.112]], "normal": [[0.0, 0.0, 1.0]]}
+TABLE: dict[str, Any] = {"point": [[0.0, 0.0, -0.112]], "normal": [[0.0, 0.0, 1.0]]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +128,7 @@ class Demo:
         report = loop.run(seconds, until or (lambda: False))
         if loop.error is not None:
             self.robot.recover()
+            time.sleep(1.0)  # for the arm to settle
         return report
 
     def go_to_start(self) -> deploy.Report:
@@ -186,10 +190,15 @@ class Demo:
         """One episode on the server, and the same in our own simulation."""
         points = self.points()
         sphere = self.sphere(points) if number % 2 else None
-        went = self.go_to_start()
-        q, _ = self.robot.look()
         found = {"episode": number, "sphere": sphere is not None}
-        found |= self.fly(self.robot, points, sphere)
+        q = self.deployed.start
+        for aborts in range(ATTEMPTS):
+            if self.go_to_start().reason is None:
+                q, _ = self.robot.look()
+                found |= self.fly(self.robot, points, sphere)
+                if found["reason"] is None:
+                    break
+            found["aborts"] = aborts + 1
         stand = stored()["fr3"]
         robot = rmp.Robot.load("fr3", mount=stand.mount, finger=stand.turn)
         model = robot.mj_model
@@ -198,7 +207,7 @@ class Demo:
         data.qpos[:] = q
         own = self.fly(MujocoBackend(model, data, 7), points, sphere)
         keep = ("reached", "times", "nearest_cm", "clearance_cm")
-        return found | {"start": went.reason, "own": {k: own[k] for k in keep}}
+        return {"aborts": 0} | found | {"own": {k: own[k] for k in keep}}
 
     def hold(self) -> dict:
         """Drift of an arm that only holds itself, in three seconds."""
@@ -228,7 +237,9 @@ class Demo:
             return goal(q, qd, t, seen)
 
         loop = self._loop(self.robot, sleepy, self.source(), late=9.0)
-        report = self._run(loop, 5.0)
+        report = loop.run(5.0)
+        self.robot.recover()
+        time.sleep(1.0)  # for the arm to settle
         again = self.hold()
         return {"reason": report.reason, "after": again["reason"]}
 
@@ -248,10 +259,13 @@ def table(rows: list[dict]) -> str:
     """The episodes in Markdown."""
     lines = [
         "| episode | sphere | visited | last point [s] | own simulation [s] "
-        "| clearance, own [cm] | torque | rate | tick p50, p99, worst [ms] | stopped |",
+        "| clearance, own [cm] | torque | rate | tick p50, p99, worst [ms] | anew |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
+        if "times" not in row:
+            lines.append(f"| {row['episode']} | never begun |")
+            continue
         p50, p99, _, worst = row["interval_ms"]
         own = row["own"]
         lines.append(
@@ -260,17 +274,13 @@ def table(rows: list[dict]) -> str:
             f"| {(own['times'] or [np.nan])[-1]} "
             f"| {row['clearance_cm']}, {own['clearance_cm']} "
             f"| {100 * row['torque']:.0f} % | {100 * row['torque_rate']:.0f} % "
-            f"| {p50}, {p99}, {worst} | {row['reason'] or '-'} |"
+            f"| {p50}, {p99}, {worst} | {row['aborts']} |"
         )
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Run everything.
-
-    Returns:
-        1 if something was touched, or an episode that nobody stopped missed a point.
-    """
+    """Run everything; 1 if an episode missed a via point or touched something."""
     options = tyro.cli(Options, config=(tyro.conf.OmitArgPrefixes,))
     runtime.configure()
     options.folder.mkdir(parents=True, exist_ok=True)
@@ -284,7 +294,7 @@ def main() -> int:
         for number in range(options.episodes):
             row = demo.episode(number)
             found["episodes"].append(row)
-            print(f"episode {number}: {row['reached']} of 4 visited", flush=True)
+            print(f"episode {number}: {row.get('reached', 0)} of 4 visited", flush=True)
         found["stale"] = demo.stale()
         found["reflex"] = demo.reflex()
     rows = found["episodes"]
@@ -295,8 +305,8 @@ def main() -> int:
         command = "python -m benchmarks.deploy_demo " + " ".join(sys.argv[1:])
         about = {"command": command.strip(), "machine": machine()}
         options.json.write_text(json.dumps(about | found, indent=1) + "\n")
-    failed = [r for r in rows if r["reached"] < 4 and r["reason"] is None]
-    return int(bool(failed) or any(r["clearance_cm"] < 0 for r in rows))
+    good = [r.get("reached") == 4 and r["clearance_cm"] > 0.0 for r in rows]
+    return 1 - all(good)
 
 
 if __name__ == "__main__":

@@ -18,20 +18,25 @@ simulation: `read` returns at once, and a tick takes exactly a period."""
 class Backend(Protocol):
     """A robot under torque control."""
 
-    pace: Pace
-    """Who keeps time."""
-    carries_weight: bool
-    """Whether the robot adds what holds it against gravity, so that it is not sent."""
+    @property
+    def pace(self) -> Pace:
+        """Who keeps time."""
+        ...
+
+    @property
+    def carries_weight(self) -> bool:
+        """Whether the robot adds what holds it against gravity, which is not sent."""
+        ...
 
     def read(self) -> State:
         """The state now."""
         ...
 
-    def write(self, tau: np.ndarray) -> None:
+    def write(self, tau: np.ndarray, /) -> None:
         """Send torques, (n,) [N m]."""
         ...
 
-    def finish(self, tau: np.ndarray) -> None:
+    def finish(self, tau: np.ndarray, /) -> None:
         """Send the last torques; the robot holds itself from then on."""
         ...
 

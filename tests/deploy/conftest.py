@@ -8,6 +8,7 @@ import pytest
 
 import envs
 from envs import export
+from envs.deployment import controller_of
 from envs.flags import load_config
 from rmp_mjx import deploy
 from rmp_mjx.sim.robot import MujocoBackend
@@ -39,7 +40,7 @@ def trained(root):
     _, agent = policies.load_agent(
         env, config, path, True, pytest.fail, besides=("arm",)
     )
-    controller = env.controller.replace(period=0.001)
+    controller = controller_of(env, 0.001)
     return SimpleNamespace(
         env=env, agent=agent, controller=controller, key=jax.random.key(0)
     )

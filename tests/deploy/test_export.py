@@ -107,7 +107,7 @@ def test_numpy_and_onnx_have_the_same_policy(exported, trained):
     )
     session = onnxruntime.InferenceSession(read_parts(exported)[1]["policy.onnx"])
     (found,) = session.run(["action"], {"observation": obs})
-    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(found), wanted, atol=1e-5)
 
 
 def test_a_file_says_what_it_is(deployed):

@@ -138,6 +138,7 @@ def test_missing_bindings_are_named(deployed, monkeypatch):
         FrankaBackend(deployed, "x")
 
 
+@pytest.mark.slow
 def test_the_policy_works_against_a_server_of_the_robots_protocol(root, tmp_path):
     """One episode with a sphere and one without; the rest of the demo besides."""
     places = root / "build/franka-sim", root / "build/pylibfranka"

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -243,12 +244,13 @@ def test_any_thread_may_put_obstacles(deployed):
     assert (after.number, after.stamp) == (before.number + 1, 5.0)
     assert after.slots["spheres"]["active"].tolist() == [True, False, False, False]
     assert not before.slots["spheres"]["active"].any()  # what was read stays
-    for fields, message in (
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"center": np.zeros((5, 3)), "radius": np.ones(5)}, "at most 4"),
         ({"center": np.zeros((2, 3)), "radius": np.ones(1)}, "at most 4"),
         ({"center": [[np.nan, 0, 0]], "radius": [1.0]}, "must be finite"),
         ({"centre": [[0, 0, 0]]}, "no centre, only"),
-    ):
+    ]
+    for fields, message in wrong:
         with pytest.raises(ValueError, match=message):
             source.put("spheres", **fields)
     with pytest.raises(ValueError, match="no slots for boxes"):

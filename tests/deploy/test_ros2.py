@@ -13,6 +13,8 @@ import pytest
 
 
 class Node:
+    file = ""
+
     def __init__(self, name):
         self.published, self.subscribed = [], {}
 
@@ -63,6 +65,7 @@ def module(root, exported, monkeypatch):
     path = root / "docs/examples/ros2_node.py"
     assert len(path.read_text().splitlines()) < 100
     spec = importlib.util.spec_from_file_location("ros2_node", path)
+    assert spec is not None and spec.loader is not None
     found = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(found)
     return found
