@@ -2,8 +2,8 @@
 #   make train    set up if needed, then run the main job (ARGS="--seed 1" adds options)
 #   make test     set up if needed, then run the tests
 #   make paper    set up if needed, then run the paper's experiments (PRESET=smoke)
-# The rest: lint type format faults mutants bench bench-peers bench-gate docs wheel sbom
-#   audit test-latest clean.
+# The rest: lint type format faults mutants bench bench-peers bench-gate deploy-demo docs
+#   wheel sbom audit test-latest clean.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -29,7 +29,7 @@ TOOLS := build/tools
 PIP := -m pip --disable-pip-version-check install --quiet
 
 .PHONY: help setup train paper test test-slow test-latest faults mutants lint format \
-  type bench bench-peers bench-gate docs wheel sbom audit clean
+  type bench bench-peers bench-gate deploy-demo docs wheel sbom audit clean
 
 help:
 	@sed -n '1,6s/^#  *//p' Makefile
@@ -109,6 +109,17 @@ wheel: $(STAMP)
 	cd build && installed/bin/python -P ../tests/installed.py
 	build/installed/bin/python $(PIP) --force-reinstall --no-deps dist/*.tar.gz
 	cd build && installed/bin/python -P ../tests/installed.py
+
+# A pretrained policy on an FR3 through the robot's own bindings, against a server that
+# speaks the robot's protocol. Both in places of their own: they pin old packages.
+deploy-demo: $(STAMP) build/franka-sim/.installed
+	PYTHONPATH=$(CURDIR):build/pylibfranka $(PY) -m benchmarks.deploy_demo $(ARGS)
+
+build/franka-sim/.installed:
+	$(PY) -m venv build/franka-sim
+	build/franka-sim/bin/python $(PIP) franka-sim==1.1.7
+	$(PY) $(PIP) --no-deps --target build/pylibfranka pylibfranka==0.21.3
+	@touch $@
 
 # What is installed, and under which licences: build/sbom.json (CycloneDX), licences.md.
 sbom: $(STAMP) $(TOOLS)

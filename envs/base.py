@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -9,6 +11,7 @@ from jaxtyping import Array, Float
 from rmp_mjx.control import ACTION_SIZE
 from rmp_mjx.metric import Metric, by_name
 from rmp_mjx.robot.kinematics import SiteState, point_positions
+from rmp_mjx.shapes import Spheres as SphereSlots
 from rmp_mjx.sim import PhysicsState
 
 from . import sight
@@ -237,21 +240,43 @@ class ArmEnv(World[OptionsT]):
         rng: Array,
     ) -> Array:
         """All entries in one vector; `rng` is the key of the next step."""
+
+        def measured() -> SphereSlots:
+            """What the controller gets in the next step."""
+            error = self.sphere_error(jax.random.split(rng)[1])
+            return self.obstacles(data, spheres, error).spheres
+
+        q = data.qpos[: self.robot.n]
+        return self.assemble(site, q, self.observe(data, site, task), measured)
+
+    def assemble(
+        self,
+        site: SiteState,
+        q: Float[Array, " n"],
+        values: dict[str, Array],
+        spheres: Callable[[], SphereSlots],
+    ) -> Array:
+        """All entries of an observation in one vector.
+
+        Args:
+            site: The grip.
+            q: Joint positions of the arm [rad].
+            values: The task's entries, from `observe`.
+            spheres: Gives the spheres as the controller sees them; called if the policy
+                sees any.
+        """
         values = {
             "position": site.p,
             "rotation": site.R,
             "velocity": site.v,
             "angular_velocity": site.w,
-        }
-        values |= self.observe(data, site, task)
+        } | values
         if self.options.seen_spheres:
-            # The measurement that the controller gets in the next step.
-            error = self.sphere_error(jax.random.split(rng)[1])
             values |= sight.look(
                 self.options.seen_spheres,
                 site,
-                self.obstacles(data, spheres, error).spheres,
-                point_positions(self.robot, data.qpos[: self.robot.n]),
+                spheres(),
+                point_positions(self.robot, q),
                 jnp.asarray(self.robot.points.radius),
             )
         return jnp.concatenate([values[e.name].reshape(-1) for e in self.entries])

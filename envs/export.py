@@ -1,8 +1,11 @@
-"""A checkpoint's policy as one file: `python -m envs.export RUN FILE`.
+"""A policy as one file: `export.py`, and `rmp-mjx-export` where this is installed.
 
-A run that finishes writes the file of its last policy itself.
+NAME.rmp holds policy and controller for a robot (`rmp_mjx.deploy`), NAME.safetensors
+the policy alone. A run that finishes writes the latter of its last policy itself.
 """
 
+import dataclasses
+import importlib.util
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,23 +17,36 @@ import tyro
 from rich.console import Console
 
 from rmp_mjx import runtime
+from rmp_mjx.deploy.artefact import SUFFIX as ROBOT
 from rmp_mjx.training.config import ConfigError
-from rmp_mjx.training.policy import save_policy
-from rmp_mjx.training.runs import policies
+from rmp_mjx.training.policy import load_policy, save_policy
+from rmp_mjx.training.runs import identity, policies, run_folder
 from rmp_mjx.training.runs.checkpoint import NEWEST, CheckpointError
 
-from . import registry
+from . import deployment, registry
+from .base import ArmEnv
 from .flags import load_config, parse
+from .options import CTRL_DT
+
+MOST_SPHERES = 64
+"""A robot's loop has no time for more."""
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Write a policy of a run as one file."""
+    """Write a policy with its controller for a robot, or a policy alone."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
-    file: Annotated[Path, tyro.conf.Positional]
-    """File to write, NAME.safetensors; must not exist yet."""
+    run: Annotated[str, tyro.conf.Positional]
+    """Run folder, or policy file; NAME may stand for NAME.safetensors."""
+    out: Path
+    """File to write, which must not exist yet: NAME.rmp for a robot, or
+    NAME.safetensors for the policy alone."""
+    robot: str | None = None
+    """Arm that the file is for; default: the run's. For NAME.rmp."""
+    period: float = 0.001
+    """Time between two calls of the controller on the robot [s]. For NAME.rmp."""
+    spheres: int = 4
+    """Slots for spheres that the robot is told of. For NAME.rmp."""
     checkpoint: str = NEWEST
     """Which checkpoint of the run: newest, best (by the success, then the return, of
     training's episodes), or an iteration's number."""
@@ -52,23 +68,63 @@ def export(options: ExportOptions, note: Callable[[str], None]) -> None:
             exists.
         CheckpointError: There is no such checkpoint.
     """
-    run, file, k = options.run, options.file, options.seed_index
-    if file.suffix != policies.SUFFIX:
-        raise ConfigError(f"{file}: a policy file is called NAME{policies.SUFFIX}")
+    file, k = options.out, options.seed_index
+    if file.suffix not in (policies.SUFFIX, ROBOT):
+        raise ConfigError(
+            f"{file}: name it NAME{ROBOT} for a robot, or NAME{policies.SUFFIX} for "
+            "the policy alone"
+        )
     if file.exists():
         raise ConfigError(f"{file} exists already: delete it, or name another file")
     if not file.parent.is_dir():
         raise ConfigError(f"{file}: there is no folder {file.parent}")
     if options.env:
         registry.task(options.env)
+    run = policies.find(options.run)
     config = load_config(run)
     if not 0 <= k < config.ppo.num_seeds:
         raise ConfigError(f"seed_index must lie in 0 .. {config.ppo.num_seeds - 1}")
-    env = registry.make(config.task)
+    if not run.is_dir() and options.checkpoint != NEWEST:
+        raise ConfigError(f"{run} is one policy: leave checkpoint out")
+    task, besides = config.task, ()
+    if file.suffix == ROBOT:
+        _check(options)
+        if not issubclass(registry.task(task.env), ArmEnv):
+            raise ConfigError(f"task '{task.env}' has no arm that a robot could be")
+    elif options.robot:
+        raise ConfigError("a policy alone has no arm: leave robot out")
+    if options.robot and options.robot != task.robot:
+        task, besides = dataclasses.replace(task, robot=options.robot), (identity.ARM,)
+    env = registry.make(task)
     iterations, agent = policies.load_agent(
-        env, config, run, True, note, k, options.checkpoint
+        env, config, run, True, note, k, options.checkpoint, besides
     )
-    save_policy(file, agent, policies.describe(config, k, run, iterations, None))
+    if run.is_dir():
+        own = run_folder.seed_folders(config, run)[k]
+        newest = file.suffix == ROBOT and options.checkpoint == NEWEST
+        figures = policies.evaluation(own) if newest else None
+        about = policies.describe(config, k, run, iterations, figures)
+    else:
+        about = load_policy(run).about
+    if file.suffix == ROBOT:
+        period, spheres = options.period, options.spheres
+        deployment.export(file, env, agent, about, period, spheres)
+    else:
+        save_policy(file, agent, about)
+
+
+def _check(options: ExportOptions) -> None:
+    """Refuse a loop that no robot has.
+
+    Raises:
+        ConfigError: A value is none.
+    """
+    if not 1e-4 <= options.period <= CTRL_DT:
+        raise ConfigError(f"period must be in [0.0001, {CTRL_DT}] s")
+    if not 0 <= options.spheres <= MOST_SPHERES:
+        raise ConfigError(f"spheres must be at most {MOST_SPHERES}, at least 0")
+    if importlib.util.find_spec("onnx") is None:
+        raise ConfigError("this needs onnx: pip install 'rmp-mjx[deploy]'")
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -81,7 +137,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, CheckpointError) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, soft_wrap=True)
         return 1 if isinstance(error, CheckpointError) else 2
-    say(f"written: {options.file}, {options.file.stat().st_size / 1000:.0f} kB")
+    say(f"written: {options.out}, {options.out.stat().st_size / 1000:.0f} kB")
     return 0
 
 

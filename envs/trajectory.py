@@ -76,6 +76,14 @@ class Trajectory(ArmEnv[TrajectoryOptions]):
             Entry("reached", n, "-", "1 for each of them that is reached"),
         )
 
+    @property
+    def told(self) -> dict[str, Array]:
+        """Via points, and how many are reached."""
+        return {
+            "points": jnp.zeros((self.n_points, 3)),
+            "reached": jnp.zeros((), jnp.int32),
+        }
+
     def begin(
         self, rng: Array, q: Float[Array, " n"]
     ) -> tuple[Array, dict[str, Array]]:
@@ -111,7 +119,7 @@ class Trajectory(ArmEnv[TrajectoryOptions]):
         return Score(task, reward, finished, {"via_points": hit})
 
     def observe(
-        self, data: PhysicsState, site: SiteState, task: dict[str, Array]
+        self, data: PhysicsState | None, site: SiteState, task: dict[str, Array]
     ) -> dict[str, Array]:
         """Via points and which are reached."""
         points, reached = task["points"], task["reached"]

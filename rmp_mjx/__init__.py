@@ -1,36 +1,32 @@
 """Safe, contact-rich manipulation: an RMP-tree with a learned impedance target."""
 
-from rmp_mjx.control import ACTION_SIZE as ACTION_SIZE
-from rmp_mjx.control import RMPVICES as RMPVICES
-from rmp_mjx.control import VICES as VICES
-from rmp_mjx.control import ActionRange as ActionRange
-from rmp_mjx.control import ContactObserver as ContactObserver
-from rmp_mjx.control import Controller as Controller
-from rmp_mjx.control import Leaves as Leaves
-from rmp_mjx.control import OrientationRelaxation as OrientationRelaxation
-from rmp_mjx.control import SetpointDither as SetpointDither
-from rmp_mjx.control import StopGuard as StopGuard
-from rmp_mjx.control import WeightedActionRange as WeightedActionRange
-from rmp_mjx.control import per_link as per_link
-from rmp_mjx.control import rmp_vices_literal as rmp_vices_literal
-from rmp_mjx.obstacles import Obstacles as Obstacles
-from rmp_mjx.rmp import RMP as RMP
-from rmp_mjx.rmp import Leaf as Leaf
-from rmp_mjx.rmp import Node as Node
-from rmp_mjx.rmp import ScalarLeaf as ScalarLeaf
-from rmp_mjx.rmp import Siblings as Siblings
-from rmp_mjx.rmp import TaskMap as TaskMap
-from rmp_mjx.rmp import evaluate as evaluate
-from rmp_mjx.rmp import pullback as pullback
-from rmp_mjx.rmp import pushforward as pushforward
-from rmp_mjx.rmp import resolve as resolve
-from rmp_mjx.robot import Robot as Robot
-from rmp_mjx.robot import RobotError as RobotError
-from rmp_mjx.robot import RobotWarning as RobotWarning
-from rmp_mjx.robot import robots as robots
-from rmp_mjx.types import Action as Action
-from rmp_mjx.types import ControlOutput as ControlOutput
-from rmp_mjx.types import LeafWeights as LeafWeights
-from rmp_mjx.types import Setpoint as Setpoint
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rmp_mjx.facade import *  # noqa: F403
 
 __version__ = "0.2.0"
+
+
+def __getattr__(name: str) -> Any:
+    """A module or a public name, loaded when it is asked for first.
+
+    So `rmp_mjx.deploy`, which a robot's computer imports, needs no MuJoCo and no Flax.
+    """
+    if not name.startswith("_"):
+        if importlib.util.find_spec(f"rmp_mjx.{name}"):
+            return importlib.import_module(f"rmp_mjx.{name}")
+        facade = importlib.import_module("rmp_mjx.facade")
+        public = {k: v for k, v in vars(facade).items() if not k.startswith("_")}
+        globals().update(public)
+        if name in globals():
+            return globals()[name]
+    raise AttributeError(f"module 'rmp_mjx' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """The public names, whether they are loaded or not."""
+    facade = importlib.import_module("rmp_mjx.facade")
+    return sorted({*globals(), *vars(facade)})

@@ -35,6 +35,13 @@ def evaluate() -> int:
     return evaluation.main()
 
 
+def export() -> int:
+    """`rmp-mjx-export`."""
+    with _extra("train"):
+        from rmp_mjx_envs import export
+    return export.main()
+
+
 def replay() -> int:
     """`rmp-mjx-replay`."""
     with _extra("train"):

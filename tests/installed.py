@@ -24,11 +24,11 @@ def main() -> None:
     place = Path(rmp.__file__).resolve()
     assert Path(sys.prefix).resolve() in place.parents, f"imported from {place}"
     assert (importlib.resources.files("rmp_mjx") / "py.typed").is_file()
-    for absent in ("envs", "train", "eval", "tests", "benchmarks"):
+    for absent in ("envs", "train", "eval", "export", "tests", "benchmarks"):
         assert importlib.util.find_spec(absent) is None, f"{absent} is installed"
     for absent in ("brax", "polars", "tyro", "matplotlib"):
         assert importlib.util.find_spec(absent) is None, f"{absent} is not asked for"
-    for name in ("train", "eval", "replay", "check-robot"):
+    for name in ("train", "eval", "replay", "export", "check-robot"):
         command = [Path(sys.executable).with_name(f"rmp-mjx-{name}"), "--help"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 2, done

@@ -171,7 +171,7 @@ STARTS = {
     "report": ["run"],
     "replay": ["steps"],
     "paper": ["--folder", "new", "--only", "door/osc/0"],
-    "export": ["run", "new.safetensors"],
+    "export": ["run", "--out=new.safetensors"],
 }
 """What each command line begins with."""
 

@@ -54,7 +54,8 @@ def test_the_wheel_carries_every_module_and_description(wheel, root, folder, ins
 def test_the_console_commands_are_functions_of_the_package(project):
     scripts = project["scripts"]
     assert set(scripts) == {
-        f"rmp-mjx-{name}" for name in ("train", "eval", "replay", "check-robot")
+        f"rmp-mjx-{name}"
+        for name in ("train", "eval", "replay", "export", "check-robot")
     }
     for target in scripts.values():
         module, _, function = target.partition(":")

@@ -81,6 +81,20 @@ def _biases(arrays: Mapping[str, np.ndarray]) -> list[str]:
     return sorted(found, key=lambda name: int(name.split("/hidden_")[1].split("/")[0]))
 
 
+def arrays_of(agent: Agent) -> dict[str, np.ndarray]:
+    """The arrays of a policy by name, as its file has them.
+
+    Args:
+        agent: What `make_agent` returned, of one seed.
+    """
+    normalizer, params = agent.args  # pyright: ignore[reportFunctionMemberAccess]
+    parts = {
+        NORMALIZER: {"mean": normalizer.mean, "std": normalizer.std},
+        NETWORK: params,
+    }
+    return {name: np.asarray(leaf) for name, leaf in _named(parts).items()}
+
+
 def save_policy(path: Path, agent: Agent, about: Mapping[str, Any]) -> None:
     """Write a policy; a process that is killed leaves the old file or the new one.
 
@@ -89,12 +103,7 @@ def save_policy(path: Path, agent: Agent, about: Mapping[str, Any]) -> None:
         agent: What `make_agent` returned, of one seed.
         about: What it is; JSON-ready.
     """
-    normalizer, params = agent.args  # pyright: ignore[reportFunctionMemberAccess]
-    parts = {
-        NORMALIZER: {"mean": normalizer.mean, "std": normalizer.std},
-        NETWORK: params,
-    }
-    arrays = {name: np.asarray(leaf) for name, leaf in _named(parts).items()}
+    arrays = arrays_of(agent)
     head = _head(arrays, about)
     with replacing(path) as temporary:
         temporary.write_bytes(save(arrays, {KEY: json.dumps(head)}))

@@ -273,11 +273,13 @@ def test_no_file_makes_a_command_import_a_module(folder, more):
 
 def test_no_file_makes_replay_or_export_import_a_module(folder, own, capsys):
     places = hostile(folder)
-    assert export.main([places["run"], "new.safetensors"]) == 2
+    assert export.main([places["run"], "--out", "new.safetensors"]) == 2
     assert "add --env trap:Reach" in " ".join(capsys.readouterr().err.split())
     assert "trap" not in sys.modules
     for command in (replay.main, export.main):
-        args = [places["run"], *(["x.safetensors"] if command is export.main else [])]
+        args = [places["run"]]
+        if command is export.main:
+            args += ["--out", "x.safetensors"]
         assert command([*args, "--env", "trap:Reach"]) == 2
         assert "SystemExit: imported" in capsys.readouterr().err
 

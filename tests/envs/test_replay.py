@@ -127,7 +127,7 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize("seed_index", [0, 1])
 def test_an_exported_policy_acts_as_the_checkpoint(folder, tmp_path, seed_index):
     file = tmp_path / "toy.safetensors"
-    options = [str(folder), str(file), "--seed_index", str(seed_index)]
+    options = [str(folder), "--out", str(file), "--seed_index", str(seed_index)]
     assert export.main([*options, "--checkpoint", "2"]) == 0
     obs, key = jax.random.normal(jax.random.key(0), (20, 3)), jax.random.key(1)
     config = load_config(folder)
@@ -152,12 +152,17 @@ def test_an_exported_policy_acts_as_the_checkpoint(folder, tmp_path, seed_index)
         ("no/toy.safetensors", [], 2, "there is no folder"),
         ("toy.safetensors", ["--seed_index", "2"], 2, "must lie in 0 .. 1"),
         ("toy.safetensors", ["--checkpoint", "3"], 1, "no checkpoint '3'"),
+        ("toy.safetensors", ["--robot", "fr3"], 2, "leave robot out"),
+        ("toy.rmp", [], 2, "'counter' has no arm"),
+        ("toy.rmp", ["--period", "0"], 2, "period must be in"),
+        ("toy.rmp", ["--spheres", "-1"], 2, "spheres must be"),
     ],
 )
 def test_what_cannot_be_exported_is_said(
     folder, tmp_path, capsys, name, more, code, message
 ):
     (tmp_path / "there.safetensors").touch()
-    assert export.main([str(folder), str(tmp_path / name), *more]) == code
+    args = [str(folder), "--out", str(tmp_path / name), *more]
+    assert export.main(args) == code
     assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["there.safetensors"]

@@ -1,0 +1,167 @@
+"""A trained policy with its controller as one file for a robot."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rmp_mjx.control.controller import ImpedanceController
+from rmp_mjx.deploy import artefact
+from rmp_mjx.deploy.card import card
+from rmp_mjx.deploy.numpy_policy import WEIGHTS
+from rmp_mjx.deploy.onnx_policy import to_onnx
+from rmp_mjx.deploy.programs import Program, control_programs, serialised
+from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.robot.kinematics import arm_state, site_state
+from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.learning.networks import OBS_LIMIT, Agent
+from rmp_mjx.training.policy import arrays_of
+from rmp_mjx.training.runs import run_folder
+
+from .arms import JACO
+from .base import ArmEnv
+from .options import CTRL_DT
+
+
+def controller_of(env: ArmEnv, period: float) -> ImpedanceController:
+    """The task's controller at the period of a robot [s].
+
+    Raises:
+        ConfigError: It cannot be exported.
+    """
+    controller = env.controller
+    if not isinstance(controller, ImpedanceController):
+        raise ConfigError(
+            f"'{type(controller).__name__}' cannot be exported: it is no "
+            "ImpedanceController"
+        )
+    if controller.guard is not None:
+        raise ConfigError(
+            "a guard is made for the period of the simulation: export without guard"
+        )
+    return controller.replace(period=period)
+
+
+def observe_program(env: ArmEnv, slots: Mapping[str, Any]) -> Program | None:
+    """The observation from what an arm measures; None where it takes more."""
+    told = env.told
+    if told is None:
+        return None
+
+    def observe(q, qd, told, obstacles):
+        site = site_state(env.robot, arm_state(env.robot, q, qd))
+        spheres = Obstacles.empty().spheres
+        spheres = spheres.replace(**obstacles.get("spheres", {}))
+        physics: Any = None  # not needed, by what `told` says
+        values = env.observe(physics, site, told)
+        return env.assemble(site, q, values, lambda: spheres)
+
+    zero = jnp.zeros(env.robot.n)
+    return observe, (zero, zero, told, slots)
+
+
+def plain(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a policy as `NumpyPolicy` takes them."""
+    found = {name: arrays[f"normalizer/{name}"] for name in ("mean", "std")}
+    found["limit"] = np.asarray(OBS_LIMIT, np.float32)
+    kernels = sorted(
+        (k for k in arrays if k.endswith("/kernel")),
+        key=lambda k: ("hidden_" not in k, len(k), k),
+    )
+    for i, name in enumerate(kernels):
+        found[f"W{i}"] = arrays[name]
+        found[f"b{i}"] = arrays[name.replace("/kernel", "/bias")]
+    return found
+
+
+def export(
+    file: Path,
+    env: ArmEnv,
+    agent: Agent,
+    about: Mapping[str, Any],
+    period: float,
+    spheres: int,
+) -> None:
+    """Write the file.
+
+    Args:
+        file: The file, NAME.rmp.
+        env: The task with the arm that the file is for.
+        agent: The policy, acting with its mean.
+        about: What the policy's file or run says of it.
+        period: Time between two calls of the controller on the robot [s].
+        spheres: Slots for spheres.
+
+    Raises:
+        ConfigError: The controller cannot be exported.
+        ImportError: onnx is not installed.
+    """
+    controller = controller_of(env, period)
+    slots = Obstacles.empty(spheres=spheres, planes=1, **env.fixture_slots)
+    observer = None if env.observer is None else env.observer.replace(delay=0)
+    programs = control_programs(controller, observer, slots)
+    key = jax.random.key(0)  # the mean needs none
+
+    def policy(observation):
+        return agent(observation[None], key)[0]
+
+    programs["policy"] = policy, (jnp.zeros(env.observation_size),)
+    observe = observe_program(env, programs["control"][1][3])
+    if observe is not None:
+        programs["observe"] = observe
+    arrays = plain(arrays_of(agent))
+    metadata = {
+        "task": env.name,
+        "controller": env.options.controller,
+        "period": period,
+        "policy_period": CTRL_DT,
+        "observation": [list(entry) for entry in env.entries],
+        "robot": _arm(env),
+        "versions": run_folder.software(),
+        "about": dict(about),
+    }
+    parts = {
+        **serialised(programs),
+        "policy.onnx": to_onnx(arrays),
+        WEIGHTS: _npz(arrays),
+        "card.md": card(metadata, about).encode(),
+    }
+    artefact.write(file, metadata, parts)
+
+
+def _arm(env: ArmEnv) -> dict[str, Any]:
+    """What a robot's computer must know of the arm; null is no limit."""
+    robot, n = env.robot, env.robot.n
+
+    def numbers(values: Any) -> list[float | None]:
+        if values is None:
+            return [None] * n
+        return [float(x) if np.isfinite(x) else None for x in np.asarray(values)]
+
+    own = env.options.robot == JACO
+    return {
+        "name": env.options.robot if env.options.robot != JACO else robot.name,
+        "fingerprint": robot.fingerprint,
+        "joints": list(robot.joint_names),
+        "mount": [float(x) for x in env.mount],
+        "tool": "Closed fingers."
+        if own
+        else "A rigid finger of 15 cm and 60 g at the flange.",
+        "start": numbers(robot.q_home),
+        **{
+            name: numbers(getattr(robot, name))
+            for name in ("q_lower", "q_upper", "qd_max", "tau_max", "tau_rate_max")
+        },
+    }
+
+
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)  # pyright: ignore[reportArgumentType]
+    return stream.getvalue()
