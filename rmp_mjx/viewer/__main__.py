@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=list(CONTROLLERS),
         help="who drives; an arm for each",
     )
-    add("--scene", default="free", choices=list(SCENES), help="things to begin with")
+    add("--scene", default="sphere", choices=list(SCENES), help="things to begin with")
     add("--show", default="meshes", choices=["meshes", "capsules"], help="the arm as")
     add("--port", type=int, default=8080, help="the next free one if it is taken")
     add("--seconds", type=float, help="end after so long; default: never")

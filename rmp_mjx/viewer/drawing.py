@@ -170,35 +170,45 @@ def arrow(start: np.ndarray, pull: np.ndarray) -> np.ndarray:
 class Thoughts:
     """Control points, the gap and the pulls, in the scene."""
 
-    def __init__(self, scene: viser.SceneApi, robot: Robot):
-        """Make the nodes."""
+    def __init__(
+        self, scene: viser.SceneApi, robot: Robot, model: mujoco.MjModel, root: str
+    ):
+        """Make the nodes; the control points hang on the bodies below `root`."""
         self._scene = scene
         ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-        count = len(robot.points.segment)
-        self.points = scene.add_batched_meshes_simple(
-            "/points",
-            np.asarray(ball.vertices),
-            np.asarray(ball.faces),
-            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            np.zeros((count, 3)),
-            batched_scales=1.02 * np.asarray(robot.points.radius, float),
-            batched_colors=np.zeros((count, 3), np.uint8),
-            lod="off",
-            cast_shadow=False,
-        )
+        radius = 1.04 * np.asarray(robot.points.radius, float)  # outside of the arm
+        carried = np.array(robot.points.body)
+        self._points: list[tuple[np.ndarray, viser.BatchedMeshHandle]] = []
+        for name in dict.fromkeys(robot.points.body):
+            here = np.flatnonzero(carried == name)
+            handle = scene.add_batched_meshes_simple(
+                f"{root}/{model.body(name).id}/points",
+                np.asarray(ball.vertices),
+                np.asarray(ball.faces),
+                np.tile([1.0, 0.0, 0.0, 0.0], (len(here), 1)),
+                np.asarray(robot.points.body_offset, float)[here],
+                batched_scales=radius[here],
+                batched_colors=np.zeros((len(here), 3), np.uint8),
+                lod="off",
+                cast_shadow=False,
+            )
+            self._points.append((here, handle))
         self.gap = scene.add_line_segments(
             "/gap", np.zeros((1, 2, 3)), (20, 20, 20), thickness=0.006
         )
-        self.label = scene.add_label("/gap_label", "", anchor="center-left")
+        self.label = scene.add_label(
+            "/gap_label", "", anchor="bottom-left", font_screen_scale=0.8
+        )
         self.arrows: viser.ArrowsHandle | None = None
         self.show_points = self.show_gap = self.show_pulls = True
 
     def show(self, insight: Insight) -> None:
         """Draw what the tree thinks now."""
-        self.points.visible = self.show_points
-        if self.show_points:
-            self.points.batched_positions = np.asarray(insight.points, np.float32)
-            self.points.batched_colors = weight_colors(insight.weight)
+        colors = weight_colors(insight.weight)
+        for here, handle in self._points:
+            handle.visible = self.show_points
+            if self.show_points:
+                handle.batched_colors = colors[here]
         near = bool(self.show_gap and insight.clearance < 1.0)
         self.gap.visible = self.label.visible = near
         if near:

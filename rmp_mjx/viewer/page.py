@@ -143,7 +143,8 @@ class Page:
                 self.bars.content = texts.bars(insight, frame.controllers[0])
                 self.drive.say(texts.status(frame, self.pace))
             if self.pictures % _SLOW == _SLOW // 2:
-                self.charts.show(list(self.session.history))
+                with self._chart_tab:
+                    self.charts.show(list(self.session.history))
         self.recording.tick(1.0 / FRAMES)
         self.pictures += 1
 
@@ -153,11 +154,13 @@ class Page:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"{self.robot}: what the tree thinks")
         server.scene.set_up_direction("+z")
-        server.initial_camera.position = (1.5, -1.2, 1.1)
-        server.initial_camera.look_at = (0.2, 0.0, 0.45)
+        server.initial_camera.position = (1.05, -0.95, 0.95)
+        server.initial_camera.look_at = (0.3, 0.05, 0.4)
         server.scene.add_grid("/grid", 4.0, 4.0, cell_size=0.1, section_size=0.5)
         self._arms: list[drawing.Bodies] = []
-        self.thoughts = drawing.Thoughts(server.scene, self.session.robot)
+        self._fit_arms(1)
+        robot, model = self.session.robot, self.session.model
+        self.thoughts = drawing.Thoughts(server.scene, robot, model, "/arm0")
         position, wxyz = self.session.target
         self.target = server.scene.add_transform_controls(
             "/target", scale=0.18, position=position, wxyz=wxyz, depth_test=False
@@ -179,8 +182,8 @@ class Page:
             self._tree_panel()
         with tabs.add_tab("Leaves"):
             self.dials = DialPanel(self)
-        with tabs.add_tab("Charts"):
-            self.charts = Charts(server.gui, self.session.robot)
+        self._chart_tab = tabs.add_tab("Charts")
+        self.charts = Charts(server.gui, self.session.robot)
 
     def _tree_panel(self) -> None:
         gui = self.server.gui

@@ -154,6 +154,7 @@ class Session:
         """
         if scene not in SCENES:
             raise ValueError(unknown("scene", scene, list(SCENES)))
+        self.scene = scene
         self.set_things(SCENES[scene])
 
     def set_things(self, things: Sequence[Thing]) -> None:

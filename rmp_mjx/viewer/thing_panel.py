@@ -30,7 +30,9 @@ class ThingPanel:
         self.handles: list[Any] = []
         self._shown: list[tuple[str, tuple[float, ...]]] = []
         self._held: set[int] = set()
-        self.scene = gui.add_dropdown("Scene", list(SCENES))
+        self.scene = gui.add_dropdown(
+            "Scene", list(SCENES), initial_value=page.session.scene
+        )
         self.floor = gui.add_checkbox("Floor at the base", False)
         self.add = {kind: gui.add_button(f"Add {kind}") for kind in SLOTS}
         self.which = gui.add_slider("Thing number", 1, sum(SLOTS.values()), 1, 1)
