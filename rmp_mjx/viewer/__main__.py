@@ -1,6 +1,7 @@
 """The command: load an arm, open the page, run until interrupted."""
 
 import argparse
+import contextlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,12 +40,8 @@ def main(args: Sequence[str] | None = None) -> int:
         _say(Console(stderr=True), f"error: {error}")
         return 2
     _say(Console(), f"open {page.url}, end with Ctrl+C")
-    try:
+    with contextlib.suppress(KeyboardInterrupt):
         page.run(options.seconds)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        page.stop()
     return 0
 
 

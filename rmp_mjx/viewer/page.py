@@ -67,6 +67,7 @@ class Page:
         self.recording = Recording(self.server, folder)
         self._data = mujoco.MjData(session.model)
         self._dragging = False
+        self._shown_target = session.target
         self._build()
 
     @property
@@ -81,19 +82,21 @@ class Page:
     def run(self, seconds: float | None = None) -> None:
         """Simulate and draw until `stop`, or for so long [s]."""
         last = start = time.perf_counter()
-        while not self._stop.is_set():
-            now = time.perf_counter()
-            if seconds is not None and now - start > seconds:
-                break
-            self.tick(now - last)
-            last = now
-            spent = time.perf_counter() - now
-            self._stop.wait(max(0.0, 1.0 / FRAMES - spent))
+        try:
+            while not self._stop.is_set():
+                now = time.perf_counter()
+                if seconds is not None and now - start > seconds:
+                    break
+                self.tick(now - last)
+                last = now
+                spent = time.perf_counter() - now
+                self._stop.wait(max(0.0, 1.0 / FRAMES - spent))
+        finally:
+            self.server.stop()
 
     def stop(self) -> None:
-        """End the loop and the server."""
+        """Let the loop end, and with it the server."""
         self._stop.set()
-        self.server.stop()
 
     def tick(self, elapsed: float) -> None:
         """Obey, simulate what the wall clock asks for, draw.
@@ -137,8 +140,9 @@ class Page:
                 bodies.move(self._data)
             self.thoughts.show(insight)
             self.things.show(frame.things)
-            if not self._dragging:
+            if not self._dragging and frame.target is not self._shown_target:
                 self.target.position, self.target.wxyz = frame.target
+                self._shown_target = frame.target
             if self.pictures % _SLOW == 0:
                 self.bars.content = texts.bars(insight, frame.controllers[0])
                 self.drive.say(texts.status(frame, self.pace))
