@@ -26,7 +26,16 @@ def main(args: Sequence[str] | None = None) -> int:
     from rmp_mjx.viewer.session import Session
 
     try:
-        options = _parser().parse_args(arguments(args))
+        options, rest = _parser().parse_known_args(arguments(args))
+        if options.run is not None:
+            from rmp_mjx_envs import view
+
+            flags = ["--run", options.run, *rest]
+            with contextlib.suppress(KeyboardInterrupt):
+                return view.main(flags, options.port, options.out, options.seconds)
+            return 0
+        if rest:
+            raise ValueError(f"unknown: {' '.join(rest)}. See --help")
         runtime.configure()
         session = Session(Robot.load(options.robot), options.controller, options.scene)
         page = Page(
@@ -52,6 +61,11 @@ def _parser() -> argparse.ArgumentParser:
         epilog=f"Names of arms here: {', '.join(robots())}.",
     )
     add = parser.add_argument
+    add(
+        "--run",
+        help="run, policy file or pretrained/NAME: play it in its task. "
+        "Flags of eval.py may follow: --deterministic --obstacles 2",
+    )
     add("--robot", default="jaco2", help="name of an arm, or path of its model")
     add(
         "--controller",

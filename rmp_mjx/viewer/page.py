@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import queue
-import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -16,14 +12,11 @@ from rmp_mjx.viewer import drawing, physics, texts
 from rmp_mjx.viewer.charts import Charts
 from rmp_mjx.viewer.dial_panel import DialPanel
 from rmp_mjx.viewer.drive_panel import DrivePanel
+from rmp_mjx.viewer.loop import FRAMES, Loop
 from rmp_mjx.viewer.recording import Recording
 from rmp_mjx.viewer.session import PERIOD, Frame, Session
 from rmp_mjx.viewer.thing_panel import ThingPanel
 
-HOST = "127.0.0.1"
-"""The page can be opened from this machine only."""
-FRAMES = 30.0
-"""Pictures per second."""
 LATE = 0.1
 """Time that is made up for at most; what is later is lost [s]."""
 _SLOW = 6
@@ -32,12 +25,8 @@ GHOSTS = ((235, 120, 30), (60, 160, 80), (150, 80, 190))
 """Colors of the second arm and the others."""
 
 
-class Page:
-    """A server, its scene and its panels; `run` is the loop, in one thread.
-
-    What users do arrives in other threads. It is put into a queue, and the loop obeys
-    between two steps.
-    """
+class Page(Loop):
+    """The scene and the panels of a session."""
 
     def __init__(
         self,
@@ -58,9 +47,7 @@ class Page:
             folder: Where recordings go.
         """
         self.session, self.robot, self.show = session, robot, show
-        self.server = viser.ViserServer(host=HOST, port=port, verbose=False)
-        self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._stop = threading.Event()
+        super().__init__(f"{robot}: what the tree thinks", port)
         self.paused, self.speed, self.back = False, 1.0, 0.0
         self.frame: Frame | None = None
         self.pace, self.pictures, self._owed = 0.0, 0, 0.0
@@ -70,45 +57,12 @@ class Page:
         self._shown_target = session.target
         self._build()
 
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return f"http://{HOST}:{self.server.get_port()}"
-
-    def order(self, what: Callable[[], None]) -> None:
-        """Let the loop do something between two steps; for other threads."""
-        self._orders.put(what)
-
-    def run(self, seconds: float | None = None) -> None:
-        """Simulate and draw until `stop`, or for so long [s]."""
-        last = start = time.perf_counter()
-        try:
-            while not self._stop.is_set():
-                now = time.perf_counter()
-                if seconds is not None and now - start > seconds:
-                    break
-                self.tick(now - last)
-                last = now
-                spent = time.perf_counter() - now
-                self._stop.wait(max(0.0, 1.0 / FRAMES - spent))
-        finally:
-            self.server.stop()
-
-    def stop(self) -> None:
-        """Let the loop end, and with it the server."""
-        self._stop.set()
-
     def tick(self, elapsed: float) -> None:
-        """Obey, simulate what the wall clock asks for, draw.
+        """Simulate what the wall clock asks for, and draw it.
 
         Args:
             elapsed: Wall time since the last call [s].
         """
-        while not self._orders.empty():
-            try:
-                self._orders.get()()
-            except ValueError as error:
-                self.drive.say(f"**{error}**")
         if not self.paused:
             self._owed += min(elapsed, LATE) * self.speed
             steps = int(self._owed / PERIOD)
@@ -123,6 +77,10 @@ class Page:
         if self.frame is None:
             self.frame = self.session.step()
         self.draw(self.frame)
+
+    def refuse(self, error: ValueError) -> None:
+        """Say why an order is not obeyed."""
+        self.drive.say(f"**{error}**")
 
     def step_once(self) -> None:
         """Pause, and go on by one step."""
@@ -155,9 +113,6 @@ class Page:
     def _build(self) -> None:
         """Make the scene and the panels."""
         server = self.server
-        server.gui.configure_theme(show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(f"{self.robot}: what the tree thinks")
-        server.scene.set_up_direction("+z")
         server.initial_camera.position = (1.05, -0.95, 0.95)
         server.initial_camera.look_at = (0.3, 0.05, 0.4)
         server.scene.add_grid("/grid", 4.0, 4.0, cell_size=0.1, section_size=0.5)

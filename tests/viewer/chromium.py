@@ -21,7 +21,7 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-SIZE = {"width": 1100, "height": 680}
+SIZE = {"width": 1000, "height": 600}
 
 
 def missing() -> str:
