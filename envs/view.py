@@ -250,7 +250,7 @@ class TaskPage(Loop):
             handle.visible = True
 
     def _mark(self, k: int, mark: Any) -> Any:
-        color = tuple(int(255 * c) for c in mark.color[:3])
+        color = np.array([255 * c for c in mark.color[:3]], np.uint8)
         name = f"/marks/{k}/{len(self._marks)}"
         add = self.server.scene
         if mark.shape == "ball":

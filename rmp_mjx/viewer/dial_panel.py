@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rmp_mjx.viewer.dials import CONTROLLERS
-
-if TYPE_CHECKING:
-    from rmp_mjx.viewer.page import Page
+from rmp_mjx.viewer.stage import Stage
 
 MOST = 5.0
 """A slider goes from zero to so many times the default."""
@@ -16,7 +14,7 @@ MOST = 5.0
 class DialPanel:
     """A folder for each controller, with reset and the same as Python."""
 
-    def __init__(self, page: Page):
+    def __init__(self, page: Stage):
         """Make the controls in the tab that is open."""
         self.page = page
         self.sliders: dict[tuple[str, str], Any] = {}

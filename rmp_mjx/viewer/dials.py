@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -12,6 +12,8 @@ from rmp_mjx.control import RMPVICES, VICES, rmp_vices_literal
 from rmp_mjx.control.cbf import FilteredVICES
 from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.robot import Robot
+
+Kind = TypeVar("Kind", bound=ImpedanceController)
 
 Dials = dict[str, float]
 """Numbers by path in the controller, `leaves.collision.mu`."""
@@ -55,9 +57,7 @@ def named(controller: ImpedanceController, values: Any) -> dict[str, Any]:
     return {name: values[k] for k, name in enumerate(names)}
 
 
-def turned(
-    controller: ImpedanceController, values: Mapping[str, Any]
-) -> ImpedanceController:
+def turned(controller: Kind, values: Mapping[str, Any]) -> Kind:
     """The controller with other parameters; they may be traced."""
 
     def pick(path, leaf):

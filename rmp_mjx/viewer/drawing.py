@@ -204,7 +204,7 @@ class Thoughts:
 
     def show(self, insight: Insight) -> None:
         """Draw what the tree thinks now."""
-        colors = weight_colors(insight.weight)
+        colors = weight_colors(np.asarray(insight.weight))
         for here, handle in self._points:
             handle.visible = self.show_points
             if self.show_points:
@@ -217,7 +217,10 @@ class Thoughts:
             self.label.position = ends.mean(axis=0)
             self.label.text = f"{1e3 * float(insight.clearance):.0f} mm"
         names = list(insight.pull)
-        ends = np.stack([arrow(insight.start[n], insight.pull[n]) for n in names])
+        starts, pulls = insight.start, insight.pull
+        ends = np.stack(
+            [arrow(np.asarray(starts[n]), np.asarray(pulls[n])) for n in names]
+        )
         if self.arrows is None:
             self.arrows = self._scene.add_arrows(
                 "/pulls",

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rmp_mjx.viewer.dials import CONTROLLERS
 from rmp_mjx.viewer.session import KP, REMEMBERED
-
-if TYPE_CHECKING:
-    from rmp_mjx.viewer.page import Page
+from rmp_mjx.viewer.stage import Stage
 
 SPEEDS = ("1", "1/2", "1/4", "1/10")
 """Simulated seconds per second."""
@@ -24,7 +20,7 @@ STRONGEST = 60.0
 class DrivePanel:
     """Controllers, stiffness, push, pause, slow motion, history, recording."""
 
-    def __init__(self, page: Page):
+    def __init__(self, page: Stage):
         """Make the controls in the tab that is open."""
         self.page = page
         gui, names = page.server.gui, list(CONTROLLERS)

@@ -8,6 +8,8 @@ $M_q^{-1}$.
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import NamedTuple
 
 import jax
@@ -82,7 +84,7 @@ def think(
         return jnp.sqrt(jnp.sum(solve_lower(L, f[:, None]) ** 2))
 
     branches = controller.asked(arm, setpoint, obstacles, tau_ext)
-    root = sum(rmp.M for rmp in branches.values())
+    root = functools.reduce(operator.add, [rmp.M for rmp in branches.values()])
     state = point_state(robot, arm)
     world = (state.x + Vec(*base_point(robot))).stack(1)
     leaves = controller.leaves

@@ -12,9 +12,9 @@ from rmp_mjx.viewer import drawing, physics, texts
 from rmp_mjx.viewer.charts import Charts
 from rmp_mjx.viewer.dial_panel import DialPanel
 from rmp_mjx.viewer.drive_panel import DrivePanel
-from rmp_mjx.viewer.loop import FRAMES, Loop
-from rmp_mjx.viewer.recording import Recording
+from rmp_mjx.viewer.loop import FRAMES
 from rmp_mjx.viewer.session import PERIOD, Frame, Session
+from rmp_mjx.viewer.stage import Stage
 from rmp_mjx.viewer.thing_panel import ThingPanel
 
 LATE = 0.1
@@ -25,7 +25,7 @@ GHOSTS = ((235, 120, 30), (60, 160, 80), (150, 80, 190))
 """Colors of the second arm and the others."""
 
 
-class Page(Loop):
+class Page(Stage):
     """The scene and the panels of a session."""
 
     def __init__(
@@ -46,12 +46,9 @@ class Page(Loop):
             show: `meshes` or `capsules`.
             folder: Where recordings go.
         """
-        self.session, self.robot, self.show = session, robot, show
-        super().__init__(f"{robot}: what the tree thinks", port)
-        self.paused, self.speed, self.back = False, 1.0, 0.0
-        self.frame: Frame | None = None
+        self.show = show
+        super().__init__(session, robot, port, folder)
         self.pace, self.pictures, self._owed = 0.0, 0, 0.0
-        self.recording = Recording(self.server, folder)
         self._data = mujoco.MjData(session.model)
         self._dragging = False
         self._shown_target = session.target
@@ -81,11 +78,6 @@ class Page(Loop):
     def refuse(self, error: ValueError) -> None:
         """Say why an order is not obeyed."""
         self.drive.say(f"**{error}**")
-
-    def step_once(self) -> None:
-        """Pause, and go on by one step."""
-        self.paused, self.back = True, 0.0
-        self.frame = self.session.step()
 
     def draw(self, frame: Frame) -> None:
         """Show a frame in all browsers."""

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import trimesh
 import viser
 
 from rmp_mjx.viewer.drawing import capsule_mesh
+from rmp_mjx.viewer.stage import Stage
 from rmp_mjx.viewer.things import SCENES, SIZES, SLOTS, Thing
-
-if TYPE_CHECKING:
-    from rmp_mjx.viewer.page import Page
 
 NEW = (0.45, 0.0, 0.5)
 """Where a new thing appears [m]."""
@@ -24,7 +22,7 @@ _COLOR = (70, 150, 110)
 class ThingPanel:
     """Adds, drags, sizes, moves and removes things."""
 
-    def __init__(self, page: Page):
+    def __init__(self, page: Stage):
         """Make the controls in the tab that is open."""
         self.page, gui = page, page.server.gui
         self.handles: list[Any] = []
@@ -36,8 +34,10 @@ class ThingPanel:
         self.floor = gui.add_checkbox("Floor at the base", False)
         self.add = {kind: gui.add_button(f"Add {kind}") for kind in SLOTS}
         self.which = gui.add_slider("Thing number", 1, sum(SLOTS.values()), 1, 1)
-        self.size = gui.add_vector3("Size", (0.06,) * 3, min=(0.01,) * 3, step=0.01)
-        self.velocity = gui.add_vector3("Velocity", (0.0,) * 3, step=0.05)
+        self.size = gui.add_vector3(
+            "Size", np.full(3, 0.06), min=np.full(3, 0.01), step=0.01
+        )
+        self.velocity = gui.add_vector3("Velocity", np.zeros(3), step=0.05)
         self.apply = gui.add_button("Set size and velocity")
         self.remove = gui.add_button("Remove it")
         self._wire()
@@ -69,8 +69,8 @@ class ThingPanel:
     def _fill(self) -> None:
         """Show the numbers of the chosen thing."""
         thing = self._chosen()
-        self.size.value = (*thing.size, *(0.06,) * 3)[:3]
-        self.velocity.value = thing.velocity
+        self.size.value = np.array([*thing.size, *(0.06,) * 3][:3])
+        self.velocity.value = np.array(thing.velocity)
 
     def _chosen(self) -> Thing:
         things = self.page.session.things
@@ -80,7 +80,7 @@ class ThingPanel:
 
     def _apply(self) -> None:
         thing = self._chosen()
-        size = self.size.value[: len(thing.size)]
+        size = tuple(map(float, self.size.value[: len(thing.size)]))
         velocity = tuple(map(float, self.velocity.value))
         new = dataclasses.replace(thing, size=size, velocity=velocity, place=None)
         self._replace(self.which.value - 1, new)
@@ -116,8 +116,8 @@ class ThingPanel:
             f"/things/{k}",
             scale=0.14,
             disable_rotations=thing.kind == "sphere",
-            position=thing.position,
-            wxyz=thing.wxyz,
+            position=np.array(thing.position),
+            wxyz=np.array(thing.wxyz),
         )
         mesh = _mesh(thing)
         scene.add_mesh_simple(

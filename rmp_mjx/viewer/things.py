@@ -68,7 +68,9 @@ class Thing:
         )
 
     def put(
-        self, position: Sequence[float], wxyz: Sequence[float] | None = None
+        self,
+        position: Sequence[float] | np.ndarray,
+        wxyz: Sequence[float] | np.ndarray | None = None,
     ) -> Thing:
         """The thing in another place."""
         return dataclasses.replace(

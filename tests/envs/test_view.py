@@ -21,9 +21,8 @@ def test_episodes_follow_each_other_and_dropped_spheres_stay(play):
     first = play.episode
     assert play.dropped == {}
     play.put(1, place)
-    for _ in range(5):
-        state = play.step()
-    assert play.episode == first + 1 and int(state.info["step"]) == 1
+    states = [play.step() for _ in range(5)]
+    assert play.episode == first + 1 and int(states[-1].info["step"]) == 1
     assert list(play.dropped) == [1]
     assert np.allclose(play.dropped[1], place)  # spheres by hand do not move
     assert len(play.history) == 5
