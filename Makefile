@@ -1,6 +1,7 @@
 # One command each, from a bare checkout: needs Python 3.11 with venv, and make.
 #   make train    set up if needed, then run the main job (ARGS="--seed 1" adds options)
 #   make test     set up if needed, then run the tests
+#   make view     set up if needed, then open the live view (ARGS="--robot panda")
 #   make paper    set up if needed, then run the paper's experiments (PRESET=smoke)
 # The rest: lint type format faults mutants bench bench-peers bench-gate deploy-demo docs
 #   wheel sbom audit test-latest clean.
@@ -28,11 +29,11 @@ LATEST_STAMP := $(LATEST)/.installed
 TOOLS := build/tools
 PIP := -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help setup train paper test test-slow test-latest faults mutants lint format \
+.PHONY: help setup train view paper test test-slow test-latest faults mutants lint format \
   type bench bench-peers bench-gate deploy-demo docs wheel sbom audit clean
 
 help:
-	@sed -n '1,6s/^#  *//p' Makefile
+	@sed -n '1,7s/^#  *//p' Makefile
 
 setup: $(STAMP)
 
@@ -47,6 +48,9 @@ $(STAMP): requirements.lock pyproject.toml
 
 train: $(STAMP)
 	$(PY) train.py $(ARGS)
+
+view: $(STAMP)
+	$(PY) -m rmp_mjx.viewer $(ARGS)
 
 paper: $(STAMP)
 	$(PY) -m benchmarks.paper --preset $(PRESET) $(ARGS)

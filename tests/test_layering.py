@@ -40,6 +40,8 @@ LAW = {
     | {"rmp", "shapes", "obstacles", "robot", "control", "sim", "runtime", "files"},
     "report": {"fields", "files", "training"},
     "deploy": BASE | {"files", "obstacles", "robot", "control"},
+    "viewer": BASE
+    | {"rmp", "shapes", "obstacles", "robot", "control", "runtime", "files"},
     "commands": {"check_robot"},
     "facade": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
     "rmp_mjx": {"facade"},
@@ -56,15 +58,18 @@ TRAINING = {
     "brax": {"config", "learning", "policy", "runs"},
 }
 TOP_LEVEL = {"envs", "rmp_mjx_envs", "train", "eval", "export", "benchmarks", "tests"}
-CONSOLE = {("rmp_mjx.commands", "rmp_mjx_envs")}
-"""The one import against the law: a console command starts a task."""
-KNOW_MUJOCO = {"robot", "sim", "check_robot"}
+CONSOLE = {
+    ("rmp_mjx.commands", "rmp_mjx_envs"),
+    ("rmp_mjx.viewer.__main__", "rmp_mjx_envs"),
+}
+"""The imports against the law: a command starts a task."""
+KNOW_MUJOCO = {"robot", "sim", "check_robot", "viewer"}
 # where tasks and training meet
 COMMAND_LINE = {
     f"envs.{name}"
     for name in [
         *("cli", "deployment", "eval", "export", "flags", "grid", "replay", "results"),
-        "train",
+        *("train", "view"),
     ]
 }
 
@@ -215,6 +220,8 @@ import orbax.checkpoint, matplotlib, mediapy, tensorboardX, rich, tyro
 from mujoco import mjx
 with contextlib.suppress(ModuleNotFoundError):
     import gymnasium
+with contextlib.suppress(ModuleNotFoundError):
+    import viser, mjviser.conversions
 before, settings = dict(os.environ), dict(jax.config.values)
 import rmp_mjx, envs
 for package in (rmp_mjx, envs):
@@ -222,7 +229,8 @@ for package in (rmp_mjx, envs):
         try:
             importlib.import_module(found.name)
         except ModuleNotFoundError as missing:  # of an extra
-            assert (found.name, missing.name) == ("envs.gym", "gymnasium"), missing
+            extra = "gymnasium" if found.name == "envs.gym" else "viser"
+            assert missing.name == extra, missing
 assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
 changed = {k for k, v in jax.config.values.items() if settings.get(k, v) != v}
 assert not changed, changed

@@ -109,13 +109,60 @@ class RMPVICES(ImpedanceController):
             obstacle; `stop_time` [s], see `torque.stop_time`; and the weights of this
             state, `attractor_weight` and `orientation_weight`, in [0, 1].
         """
-        q, qd = arm.q, arm.qd
         Mq, bias = dynamics(self.robot, arm)
         w = self._by_contact(Mq, tau_ext)
+        asked, found = self._asked(arm, setpoint, obstacles, (Mq, bias, tau_ext, w))
+        total = functools.reduce(operator.add, asked.values())
+        root = jax.tree.map(materialize, total)
+        solution = self.resolve(root, Mq, bias, arm.qd, w, tau_last)
+        return ControlOutput(
+            tau=solution.tau,
+            qdd=solution.qdd,
+            f=root.f,
+            M=root.M,
+            Mq=Mq,
+            bias=bias,
+            diagnostics=solution.limits | found,
+        )
+
+    def asked(
+        self,
+        arm: ArmState,
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+        tau_ext: Float[Array, " n"] | None = None,
+    ) -> dict[str, RMP]:
+        """What each branch of the tree asks of the joints; their sum is the root.
+
+        Args:
+            arm: State of the arm.
+            setpoint: Impedance target.
+            obstacles: Padded obstacle slots.
+            tau_ext: Joint torque of the contacts, (n,) [N m]; None: not known.
+
+        Returns:
+            RMPs on the joints, f (n,) and M (n, n), by name: `collision`,
+            `self_collision`, `position`, `orientation`, `joint_limit` and `posture` if
+            there is such a leaf, and `extra_0`, ... for branches of your own.
+        """
+        Mq, bias = dynamics(self.robot, arm)
+        w = self._by_contact(Mq, tau_ext)
+        return self._asked(arm, setpoint, obstacles, (Mq, bias, tau_ext, w))[0]
+
+    def _asked(
+        self,
+        arm: ArmState,
+        setpoint: Setpoint,
+        obstacles: Obstacles,
+        loads: tuple[Array, Array, Array | None, Array | None],
+    ) -> tuple[dict[str, RMP], dict[str, Array]]:
+        """What the branches ask, and the diagnostics of this state."""
+        q, qd = arm.q, arm.qd
+        Mq, bias, tau_ext, w = loads
         load = bias if w is None or tau_ext is None else bias - tau_ext
         leaves, stop = self._braking(Mq, load, qd)
         leaves = leaves.weighted(setpoint.weights)
-        branches, around = self._avoidance(leaves, arm, obstacles, w)
+        asked, around = self._avoidance(leaves, arm, obstacles, w)
         clearance, body_clearance = _nearest(around, arm.p.dtype)
         site = site_state(self.robot, arm)
         if self.dither is not None:
@@ -129,32 +176,23 @@ class RMPVICES(ImpedanceController):
         if self.contact is not None and w is not None:
             attractor_weight *= self.contact.attractor_weight(around.pressed)
             turning = turning_by_contact(site, Mq, w)
-        branches += self._impedance(
+        asked["position"], asked["orientation"] = self._impedance(
             site, setpoint, attractor_weight, orientation_weight, turning
         )
         if leaves.joint_limit is not None:
             leaf = leaves.joint_limit
-            branches.append(leaf(q, qd) if w is None else leaf.against(q, qd, w))
+            limit = leaf(q, qd) if w is None else leaf.against(q, qd, w)
+            asked["joint_limit"] = limit
         if leaves.posture is not None:
-            branches.append(leaves.posture(q, qd, Mq))
-        branches += [evaluate(branch, q, qd, w) for branch in self.extra]
-        root = jax.tree.map(materialize, functools.reduce(operator.add, branches))
-        solution = self.resolve(root, Mq, bias, qd, w, tau_last)
-        return ControlOutput(
-            tau=solution.tau,
-            qdd=solution.qdd,
-            f=root.f,
-            M=root.M,
-            Mq=Mq,
-            bias=bias,
-            diagnostics=solution.limits
-            | {
-                "clearance": clearance,
-                "stop_time": stop,
-                "attractor_weight": attractor_weight,
-                "orientation_weight": orientation_weight,
-            },
-        )
+            asked["posture"] = leaves.posture(q, qd, Mq)
+        for k, branch in enumerate(self.extra):
+            asked[f"extra_{k}"] = evaluate(branch, q, qd, w)
+        return asked, {
+            "clearance": clearance,
+            "stop_time": stop,
+            "attractor_weight": attractor_weight,
+            "orientation_weight": orientation_weight,
+        }
 
     def resolve(
         self,
@@ -215,7 +253,7 @@ class RMPVICES(ImpedanceController):
         attractor_weight: Float[Array, ""],
         orientation_weight: Float[Array, ""],
         turning: Float[Array, " 3"],
-    ) -> list[RMP]:
+    ) -> tuple[RMP, RMP]:
         """The two attractors of the end effector, pulled back to the joints."""
         weight = self.attractor_weight * attractor_weight
         position = PositionAttractor(setpoint.p_des, setpoint.kp_pos, weight=weight)
@@ -227,10 +265,10 @@ class RMPVICES(ImpedanceController):
             weight=weight * orientation_weight,
             feedforward=-turning,
         )
-        return [
+        return (
             pullback(position(site.p, site.v), site.J_pos, site.Jdot_qd_pos),
             pullback(orientation, site.J_ori, site.Jdot_qd_ori),
-        ]
+        )
 
     def _avoidance(
         self,
@@ -238,18 +276,18 @@ class RMPVICES(ImpedanceController):
         arm: ArmState,
         obstacles: Obstacles,
         w: Float[Array, " n"] | None,
-    ) -> tuple[list[RMP], Surroundings]:
+    ) -> tuple[dict[str, RMP], Surroundings]:
         """Collision RMPs on the joints, and what is about."""
-        branches, around = [], Surroundings({}, jnp.zeros((), arm.p.dtype))
+        asked, around = {}, Surroundings({}, jnp.zeros((), arm.p.dtype))
         if leaves.collision is not None:
             near = 0.0 if self.contact is None else self.contact.near
-            rmp, around = obstacle_branch(
+            asked["collision"], around = obstacle_branch(
                 self.robot, arm, obstacles, leaves.collision, w, near
             )
-            branches.append(rmp)
         if leaves.self_collision is not None:
-            branches.append(self_branch(self.robot, arm, leaves.self_collision, w))
-        return branches, around
+            rmp = self_branch(self.robot, arm, leaves.self_collision, w)
+            asked["self_collision"] = rmp
+        return asked, around
 
     def _orientation_weight(
         self, q: Float[Array, " n"], body_clearance: Float[Array, ""]

@@ -1,0 +1,90 @@
+"""The command: load an arm, open the page, run until interrupted."""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from rmp_mjx import runtime
+from rmp_mjx.fields import arguments
+from rmp_mjx.robot import Robot, robots
+from rmp_mjx.viewer.dials import CONTROLLERS
+from rmp_mjx.viewer.things import SCENES
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Show the page; returns the exit code."""
+    try:
+        import viser as viser
+    except ImportError as missing:
+        _say(Console(stderr=True), f"error: pip install 'rmp-mjx[viewer]': {missing}")
+        return 2
+    from rmp_mjx.viewer.page import Page
+    from rmp_mjx.viewer.session import Session
+
+    try:
+        options, rest = _parser().parse_known_args(arguments(args))
+        if options.run is not None:
+            from rmp_mjx_envs import view
+
+            flags = ["--run", options.run, *rest]
+            with contextlib.suppress(KeyboardInterrupt):
+                return view.main(flags, options.port, options.out, options.seconds)
+            return 0
+        if rest:
+            raise ValueError(f"unknown: {' '.join(rest)}. See --help")
+        runtime.configure()
+        session = Session(Robot.load(options.robot), options.controller, options.scene)
+        page = Page(
+            session,
+            options.robot,
+            port=options.port,
+            show=options.show,
+            folder=options.out,
+        )
+    except (ValueError, OSError) as error:
+        _say(Console(stderr=True), f"error: {error}")
+        return 2
+    _say(Console(), f"open {page.url}, end with Ctrl+C")
+    with contextlib.suppress(KeyboardInterrupt):
+        page.run(options.seconds)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m rmp_mjx.viewer",
+        description="Show in the browser what the tree thinks.",
+        epilog=f"Names of arms here: {', '.join(robots())}.",
+    )
+    add = parser.add_argument
+    add(
+        "--run",
+        help="run, policy file or pretrained/NAME: play it in its task. "
+        "Flags of eval.py may follow: --deterministic --obstacles 2",
+    )
+    add("--robot", default="jaco2", help="name of an arm, or path of its model")
+    add(
+        "--controller",
+        nargs="+",
+        default=["rmp_vices"],
+        choices=list(CONTROLLERS),
+        help="who drives; an arm for each",
+    )
+    add("--scene", default="sphere", choices=list(SCENES), help="things to begin with")
+    add("--show", default="meshes", choices=["meshes", "capsules"], help="the arm as")
+    add("--port", type=int, default=8080, help="the next free one if it is taken")
+    add("--seconds", type=float, help="end after so long; default: never")
+    add("--out", type=Path, default=Path("runs/viewer"), help="folder of recordings")
+    return parser
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

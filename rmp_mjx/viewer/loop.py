@@ -1,0 +1,82 @@
+"""A server for pages, and the loop that serves them."""
+
+from __future__ import annotations
+
+import abc
+import queue
+import threading
+import time
+from collections.abc import Callable
+
+import viser
+
+HOST = "127.0.0.1"
+"""A page can be opened from this machine only."""
+FRAMES = 30.0
+"""Pictures per second."""
+
+
+class Loop(abc.ABC):
+    """A server, and `run`, which does everything in one thread.
+
+    What users do arrives in other threads. It is put into a queue, and the loop obeys
+    between two ticks.
+    """
+
+    def __init__(self, title: str, port: int):
+        """Start the server.
+
+        Args:
+            title: Heading of the panel.
+            port: Where the page is; the next free one if it is taken.
+        """
+        self.server = viser.ViserServer(host=HOST, port=port, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.set_panel_label(title)
+        self.server.scene.set_up_direction("+z")
+        self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._stop = threading.Event()
+
+    @abc.abstractmethod
+    def tick(self, elapsed: float) -> None:
+        """Do what is due after so much wall time [s]."""
+
+    @abc.abstractmethod
+    def refuse(self, error: ValueError) -> None:
+        """Tell the users why an order is not obeyed."""
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def order(self, what: Callable[[], None]) -> None:
+        """Let the loop do something between two steps; for other threads."""
+        self._orders.put(what)
+
+    def run(self, seconds: float | None = None) -> None:
+        """Obey and tick until `stop`, or for so long [s]."""
+        last = start = time.perf_counter()
+        try:
+            while not self._stop.is_set():
+                now = time.perf_counter()
+                if seconds is not None and now - start > seconds:
+                    break
+                self._obey()
+                self.tick(now - last)
+                last = now
+                spent = time.perf_counter() - now
+                self._stop.wait(max(0.0, 1.0 / FRAMES - spent))
+        finally:
+            self.server.stop()
+
+    def stop(self) -> None:
+        """Let the loop end, and with it the server."""
+        self._stop.set()
+
+    def _obey(self) -> None:
+        while not self._orders.empty():
+            try:
+                self._orders.get()()
+            except ValueError as error:
+                self.refuse(error)

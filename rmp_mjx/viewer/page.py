@@ -1,0 +1,175 @@
+"""The page: draws a session in the browser and takes its users' orders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import viser
+
+from rmp_mjx.viewer import drawing, physics, texts
+from rmp_mjx.viewer.charts import Charts
+from rmp_mjx.viewer.dial_panel import DialPanel
+from rmp_mjx.viewer.drive_panel import DrivePanel
+from rmp_mjx.viewer.loop import FRAMES
+from rmp_mjx.viewer.session import PERIOD, Frame, Session
+from rmp_mjx.viewer.stage import Stage
+from rmp_mjx.viewer.thing_panel import ThingPanel
+
+LATE = 0.1
+"""Time that is made up for at most; what is later is lost [s]."""
+_SLOW = 6
+"""Bars and charts change with every so many pictures."""
+GHOSTS = ((235, 120, 30), (60, 160, 80), (150, 80, 190))
+"""Colors of the second arm and the others."""
+
+
+class Page(Stage):
+    """The scene and the panels of a session."""
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        *,
+        port: int = 8080,
+        show: str = "meshes",
+        folder: Path = Path("runs/viewer"),
+    ):
+        """Start the server.
+
+        Args:
+            session: What is shown.
+            robot: Name of its arm.
+            port: Where the page is; the next free one if it is taken.
+            show: `meshes` or `capsules`.
+            folder: Where recordings go.
+        """
+        self.show = show
+        super().__init__(session, robot, port, folder)
+        self.pace, self.pictures, self._owed = 0.0, 0, 0.0
+        self._data = mujoco.MjData(session.model)
+        self._dragging = False
+        self._shown_target = session.target
+        self._build()
+
+    def tick(self, elapsed: float) -> None:
+        """Simulate what the wall clock asks for, and draw it.
+
+        Args:
+            elapsed: Wall time since the last call [s].
+        """
+        if not self.paused:
+            self._owed += min(elapsed, LATE) * self.speed
+            steps = int(self._owed / PERIOD)
+            self._owed -= steps * PERIOD
+            for _ in range(steps):
+                self.frame = self.session.step()
+            made = steps * PERIOD / max(elapsed, 1e-6)
+            self.pace += 0.05 * (made - self.pace)
+        elif self.back and self.session.history:
+            ago = min(round(self.back / PERIOD), len(self.session.history) - 1)
+            self.frame = self.session.history[-1 - ago]
+        if self.frame is None:
+            self.frame = self.session.step()
+        self.draw(self.frame)
+
+    def refuse(self, error: ValueError) -> None:
+        """Say why an order is not obeyed."""
+        self.drive.say(f"**{error}**")
+
+    def draw(self, frame: Frame) -> None:
+        """Show a frame in all browsers."""
+        self._fit_arms(len(frame.arms))
+        insight = self.session.think(frame)
+        with self.server.atomic():
+            for bodies, arm in zip(self._arms, frame.arms, strict=True):
+                self._data.qpos[:] = arm.q
+                mujoco.mj_kinematics(self.session.model, self._data)
+                bodies.move(self._data)
+            self.thoughts.show(insight)
+            self.things.show(frame.things)
+            if not self._dragging and frame.target is not self._shown_target:
+                self.target.position, self.target.wxyz = frame.target
+                self._shown_target = frame.target
+            if self.pictures % _SLOW == 0:
+                self.bars.content = texts.bars(insight, frame.controllers[0])
+                self.drive.say(texts.status(frame, self.pace))
+            if self.pictures % _SLOW == _SLOW // 2:
+                with self._chart_tab:
+                    self.charts.show(list(self.session.history))
+        self.recording.tick(1.0 / FRAMES)
+        self.pictures += 1
+
+    def _build(self) -> None:
+        """Make the scene and the panels."""
+        server = self.server
+        server.initial_camera.position = (1.05, -0.95, 0.95)
+        server.initial_camera.look_at = (0.3, 0.05, 0.4)
+        server.scene.add_grid("/grid", 4.0, 4.0, cell_size=0.1, section_size=0.5)
+        self._arms: list[drawing.Bodies] = []
+        self._fit_arms(1)
+        robot, model = self.session.robot, self.session.model
+        self.thoughts = drawing.Thoughts(server.scene, robot, model, "/arm0")
+        position, wxyz = self.session.target
+        self.target = server.scene.add_transform_controls(
+            "/target", scale=0.18, position=position, wxyz=wxyz, depth_test=False
+        )
+        server.scene.add_icosphere("/target/ball", 0.02, (26, 110, 190))
+
+        @self.target.on_update
+        def _(event: viser.TransformControlsEvent) -> None:
+            self._dragging = event.phase != "end"
+            place = np.array(self.target.position), np.array(self.target.wxyz)
+            self.order(lambda: self._aim(place))
+
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Drive"):
+            self.drive = DrivePanel(self)
+        with tabs.add_tab("Things"):
+            self.things = ThingPanel(self)
+        with tabs.add_tab("Tree"):
+            self._tree_panel()
+        with tabs.add_tab("Leaves"):
+            self.dials = DialPanel(self)
+        self._chart_tab = tabs.add_tab("Charts")
+        self.charts = Charts(server.gui, self.session.robot)
+
+    def _tree_panel(self) -> None:
+        gui = self.server.gui
+        for label, name in {
+            "Control points by weight": "show_points",
+            "The gap": "show_gap",
+            "Pulls of the leaves": "show_pulls",
+        }.items():
+            box = gui.add_checkbox(label, True)
+
+            @box.on_update
+            def _(_, box=box, name=name) -> None:
+                self.order(lambda: setattr(self.thoughts, name, box.value))
+
+        self.bars = gui.add_html("")
+
+    def _aim(self, place: tuple[np.ndarray, np.ndarray]) -> None:
+        self.session.target = place
+        if self.frame is not None and self.paused:
+            self.frame = self.frame._replace(target=place)
+
+    def _fit_arms(self, count: int) -> None:
+        """As many arms in the scene as in the frame."""
+        model, robot = self.session.model, self.session.robot
+        while len(self._arms) > count:
+            self._arms.pop().remove()
+        while len(self._arms) < count:
+            k = len(self._arms)
+            tint = GHOSTS[(k - 1) % len(GHOSTS)] if k else None
+            if self.show == "capsules":
+                parts = drawing.capsule_parts(robot, model, tint)
+            else:
+                arm = (g for g in range(model.ngeom) if not physics.is_thing(model, g))
+                parts = drawing.mesh_parts(model, arm, tint)
+            opacity = 0.45 if k else None
+            self._arms.append(
+                drawing.Bodies(self.server.scene, model, f"/arm{k}", parts, opacity)
+            )

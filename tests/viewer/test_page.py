@@ -1,0 +1,199 @@
+"""The page in a real browser: Debian's Chromium, headless, with software WebGL."""
+
+import imageio.v3
+import numpy as np
+import pytest
+
+from rmp_mjx.viewer.page import Page
+from tests.viewer import chromium
+
+needs_chromium = pytest.mark.skipif(bool(chromium.missing()), reason=chromium.missing())
+
+HARMLESS = ("THREE.Clock", "GPU stall", "GL Driver Message")
+"""Warnings of the browser's own libraries."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium.browser() as found:
+        yield found
+
+
+@pytest.fixture
+def tabs(browser, page):
+    """Opens tabs, and closes them: each takes half a core for its software WebGL."""
+    opened = []
+
+    def opener():
+        opened.append(Tab(browser, page))
+        return opened[-1]
+
+    yield opener
+    for tab in opened:
+        tab.window.close()
+
+
+@pytest.fixture
+def page(session, tmp_path):
+    session.step()  # compiled before the clock runs
+    page = Page(session, "jaco2", port=8710, folder=tmp_path)
+    with chromium.running(page):
+        yield page
+
+
+def _idle(tab):
+    """Let the browser's events arrive."""
+    tab.window.wait_for_timeout(50)
+    return True
+
+
+class Tab:
+    """A tab of the browser with the page in it."""
+
+    def __init__(self, browser, page):
+        self.page, self.faults = page, []
+        known = set(page.server.get_clients())
+        self.window = browser.new_page(viewport=chromium.SIZE)
+        self.window.on("console", self._heard)
+        self.closed = 0
+        self.window.on("websocket", lambda socket: socket.on("close", self._closed))
+        self.window.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.window.goto(page.url)
+        self.window.wait_for_selector("canvas")
+        self.client = self.joined(known)
+
+    def joined(self, known):
+        clients = self.page.server.get_clients
+        chromium.wait(lambda: set(clients()) > known or len(clients()) == 1, "a client")
+        return clients()[max(clients())]
+
+    def _closed(self, _):
+        self.closed += 1
+
+    def _heard(self, message):
+        bad = message.type in ("error", "warning")
+        if bad and not any(word in message.text for word in HARMLESS):
+            self.faults.append(message.text)
+
+    def picture(self):
+        """The scene without the panel, as numbers."""
+        shot = self.window.screenshot(
+            clip={"x": 320, "y": 150, "width": 330, "height": 440}
+        )
+        return np.asarray(imageio.v3.imread(shot)[..., :3], float)
+
+    def click(self, name, role="button"):
+        self.window.get_by_role(role, name=name, exact=True).first.click()
+
+    def choose(self, label, option):
+        self.window.get_by_label(label, exact=True).first.click()
+        self.window.get_by_role("option", name=option, exact=True).first.click()
+
+    def drag(self, point, axis, distance):
+        """Drag a gizmo's arrow, whose tip is 15 cm from its middle."""
+        self.window.bring_to_front()
+        start = chromium.pixels(self.client, point + 0.155 * axis)
+        end = chromium.pixels(self.client, point + (0.155 + distance) * axis)
+        mouse = self.window.mouse
+        mouse.move(*(start - 2))
+        self.window.wait_for_timeout(300)
+        mouse.move(*start)
+        self.window.wait_for_timeout(800)  # software WebGL has few frames a second
+        mouse.down()
+        for share in (0.3, 0.7, 1.0):
+            mouse.move(*(start + share * (end - start)))
+            self.window.wait_for_timeout(250)
+        mouse.up()
+
+
+@needs_chromium
+def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path):
+    session = page.session
+    tab = tabs()
+    tab.window.wait_for_timeout(2000)
+    before, hand = tab.picture(), session.hand()
+    assert before.std() > 5.0  # there is something to see
+
+    tab.click("Record")
+    start = session.target[0]
+    tab.drag(start, np.array([0.0, 1.0, 0.0]), 0.2)
+    chromium.wait(lambda: session.target[0][1] > start[1] + 0.1, "the target moved")
+    chromium.wait(
+        lambda: bool(np.linalg.norm(session.hand() - session.target[0]) < 0.03),
+        "the arm follows",
+    )
+    assert session.hand()[1] > hand[1] + 0.1
+    tab.window.wait_for_timeout(1000)
+    changed = np.abs(tab.picture() - before).max(axis=2) > 30.0
+    assert changed.mean() > 0.01, "the pictures are the same"
+
+    tab.click("Things", "tab")
+    tab.click("Add sphere")
+    chromium.wait(lambda: len(session.things) == 1, "a sphere")
+    chromium.wait(lambda: np.isfinite(page.frame.arms[0].clearance), "a clearance")
+    ahead = session.target[0] + np.array([0.0, 0.02, 0.12])
+    page.order(lambda: session.set_things([session.things[0].put(ahead)]))
+    tab.window.wait_for_timeout(1500)
+    assert page.frame.arms[0].force == 0.0 and page.frame.arms[0].clearance > 0.0
+
+    tab.click("Drive", "tab")
+    tab.choose("Controller", "vices")
+    chromium.wait(lambda: page.frame.controllers == ("vices",), "another controller")
+    chromium.wait(lambda: page.frame.arms[0].force > 1.0, "VICES hits the sphere")
+    assert not page.paused and page.pace > 0.5
+
+    tab.click("Stop and save")
+    chromium.wait(lambda: list(tmp_path.glob("*.html")) != [], "a recording")
+    assert tab.faults == []
+
+    page.stop()
+    (file,) = tmp_path.glob("*.html")
+    tab.window.goto(file.as_uri())
+    tab.window.wait_for_selector("canvas")
+    tab.window.wait_for_timeout(2000)
+    assert tab.picture().std() > 5.0 and tab.faults == []
+
+
+@needs_chromium
+def test_two_tabs_show_the_same_through_a_reload_and_an_end(tabs, page):
+    first, second = tabs(), tabs()
+    first.click("Pause")
+    chromium.wait(lambda: page.paused, "a pause")
+    second.window.get_by_role("button", name="Go on", exact=True).first.wait_for()
+    first.window.reload()
+    first.window.get_by_role("button", name="Go on", exact=True).first.click()
+    chromium.wait(lambda: not page.paused, "the end of the pause")
+    second.window.wait_for_timeout(300)
+    assert first.faults == [] == second.faults
+    page.stop()
+    chromium.wait(lambda: _idle(second) and second.closed, "the end of the connection")
+    assert second.faults == []
+
+
+def test_paused_users_step_scrub_and_go_on_from_the_past(page):
+    drive, session = page.drive, page.session
+    chromium.wait(lambda: session.time > 1.0, "a second of history")
+    page.order(drive._pause)
+    chromium.wait(lambda: page.paused, "a pause")
+    time = session.time
+    page.order(drive._once)
+    chromium.wait(lambda: session.time > time, "a step")
+    assert session.time == pytest.approx(time + 0.005)
+    drive.back.value = 0.5
+    chromium.wait(lambda: page.frame.time < time - 0.4, "the past")
+    past = page.frame.time
+    page.order(drive._again)
+    chromium.wait(lambda: not page.paused, "the end of the pause")
+    assert past < session.time < time
+
+
+def test_orders_that_make_no_sense_are_answered_not_obeyed(page):
+    page.order(page.things._remove)
+    chromium.wait(lambda: "no thing number" in page.drive.status.content, "an answer")
+    for _ in range(9):
+        page.order(lambda: page.things._add("sphere"))
+    chromium.wait(lambda: len(page.session.things) == 8, "eight spheres")
+
+
+def test_the_address_is_on_this_machine_alone(page):
+    assert page.url.startswith("http://127.0.0.1:")
