@@ -8,6 +8,7 @@ import jax
 import polars as pl
 from rich.console import Console
 
+from rmp_mjx.files import write_text
 from rmp_mjx.training.config import TrainConfig
 from rmp_mjx.training.evaluation import curves, evaluate, film, report
 from rmp_mjx.training.evaluation.learning_curve import (
@@ -56,7 +57,20 @@ def finish(
     if primary:
         evaluated = config.run.eval_episodes > 0
         policies.save(agent, config, folder, result.iterations, evaluated)
+        write_page(folder, console)
     console.print(f"results: {folder}", markup=False, highlight=False)
+
+
+def write_page(folder: Path, console: Console) -> None:
+    """The run on one page of HTML that needs no other file."""
+    from rmp_mjx.report.page import page  # loads graphics libraries
+    from rmp_mjx.report.runs import grouped, read_run
+
+    try:
+        write_text(folder / run_folder.PAGE, page(grouped(read_run(folder))))
+    except ValueError as error:  # rows of another trainer
+        line = f"no {run_folder.PAGE}: {error}"
+        console.print(line, markup=False, highlight=False)
 
 
 def plot(env: ArmEnv, config: TrainConfig, folder: Path) -> None:

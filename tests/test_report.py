@@ -96,6 +96,18 @@ def test_the_page_needs_no_other_file_and_says_what_differs(runs, tmp_path, caps
     assert "num_envs" not in differing
 
 
+def test_the_page_has_each_runs_pictures_options_and_software(runs):
+    picture = runs[0] / run_folder.CLEARANCES
+    picture.write_bytes(b"no real picture")
+    found = page(grouped(run for folder in runs for run in read_run(folder)))
+    picture.unlink()
+    code = base64.b64encode(b"no real picture").decode()
+    assert f"data:image/png;base64,{code}" in found
+    assert found.count("<summary>Options</summary>") == 4
+    assert "num_envs</td>" in found
+    assert "<script" not in found
+
+
 def test_curves_that_never_move_are_named_and_not_drawn(runs):
     found = grouped(run for folder in runs for run in read_run(folder))
     moving, flat = split_curves(found)

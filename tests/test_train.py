@@ -50,6 +50,7 @@ def test_a_run_trains_evaluates_and_plots(toy, tmp_path):
     config = json.loads((folder / "config.json").read_text())
     assert config["task"]["variant"] == "heavy"
     assert (folder / "learning_curve.png").stat().st_size > 0
+    assert "<h1>" in (folder / "report.html").read_text()
     assert not (folder / "video.mp4").exists()
     about = load_policy(folder / "policy.safetensors").about
     assert about["config"]["task"] == config["task"]

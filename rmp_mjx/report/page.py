@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
+from rmp_mjx.report import details
 from rmp_mjx.report.charts import EVENTS, learning_curves, safety, split_curves
 from rmp_mjx.report.runs import Group, Run, differences, text
 from rmp_mjx.training.runs import run_folder
@@ -58,6 +59,7 @@ def page(groups: Sequence[Group]) -> str:
         _differing(groups),
         "<h2>Runs</h2>",
         _html_table(_sources(groups)),
+        *(_details(run) for group in groups for run in group.runs),
     ]
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
@@ -126,6 +128,21 @@ def _origin(run: Run) -> list[str]:
     last = run_folder.last_start(run.folder)
     software = f"{last.get('git', '?')}, jax {last.get('jax', '?')}"
     return [software, last.get("device", "?"), last.get("started", "?")]
+
+
+def _details(run: Run) -> str:
+    """The pictures, options and software of a run; the tables are folded away."""
+    name = html.escape(f"{run.folder}, seed {run.seed}")
+    parts = [f"<h2>{name}</h2>"]
+    for words, code in details.pictures(run):
+        parts.append(f'<img alt="{words}" src="data:image/png;base64,{code}">')
+    for title, lines in (
+        ("Options", details.options(run)),
+        ("Software", details.software(run)),
+    ):
+        table = _html_table(lines)
+        parts.append(f"<details><summary>{title}</summary>{table}</details>")
+    return "".join(parts)
 
 
 def _picture(figure: Figure, words: str) -> str:

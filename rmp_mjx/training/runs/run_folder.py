@@ -48,6 +48,7 @@ CLEARANCES = "clearances.png"
 INSTANCE = "instance.png"
 STORYBOARD = "storyboard.png"
 VIDEO = "video.mp4"
+PAGE = "report.html"
 LOCK = "lock"
 PACKAGES = (
     "jax",
@@ -79,6 +80,7 @@ RESULTS = (
     INSTANCE,
     STORYBOARD,
     VIDEO,
+    PAGE,
 )
 
 

@@ -1,0 +1,48 @@
+"""What one run says about itself: pictures it left, its options, its software."""
+
+import base64
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rmp_mjx.report.runs import Run, text
+from rmp_mjx.training.runs import run_folder
+
+PICTURES = {
+    run_folder.CLEARANCES: "least clearance of the evaluation's episodes",
+    run_folder.FORCES: "contact forces of the evaluation's episodes",
+    run_folder.STORYBOARD: "an episode of the evaluation",
+}
+"""Pictures of a run's folder by name, and what they show."""
+
+
+def pictures(run: Run) -> Iterator[tuple[str, str]]:
+    """What each recorded picture shows, and the picture as base64 of a PNG."""
+    place = run_folder.seed_folder(run.config, run.folder, run.seed)
+    for name, words in PICTURES.items():
+        found = [p for p in (place / name, run.folder / name) if p.is_file()]
+        if found:
+            yield words, _encoded(found[0])
+
+
+def _encoded(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode()
+
+
+def options(run: Run) -> list[list[str]]:
+    """Heading and a line for each option of a run."""
+    return [["option", "value"], *_flat(run.config.record())]
+
+
+def _flat(record: dict[str, Any], above: str = "") -> Iterator[list[str]]:
+    for name, value in record.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield [f"{above}{name}", text(value)]
+
+
+def software(run: Run) -> Sequence[Sequence[str]]:
+    """Heading and a line for each version at a run's last start."""
+    found = run_folder.last_start(run.folder)
+    return [["software", "version"], *([k, text(v)] for k, v in found.items())]
