@@ -34,6 +34,8 @@ LONGEST = 0.35
 _HALFWAY = 10.0
 """Acceleration whose arrow has half of that length [m/s^2]."""
 _RAMP = np.array([[170, 175, 180], [254, 217, 118], [253, 141, 60], [200, 10, 30]])
+_OPACITY = 0.45
+"""Of the control points: the arm below them is seen."""
 _VISIBLE_GROUPS = 3
 """MuJoCo shows the geoms of the groups before this one."""
 
@@ -91,11 +93,15 @@ def mesh_parts(
 
     Args:
         model: The model.
-        geoms: Their ids. Those of hidden groups are left out if others are visible.
+        geoms: Their ids. Those of hidden groups are left out if others are visible,
+            and those that touch where a body has others for the eye alone.
         tint: One color for all; None: the model's.
     """
     geoms = list(geoms)
     shown = [g for g in geoms if model.geom_group[g] < _VISIBLE_GROUPS] or geoms
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    adorned = {model.geom_bodyid[g] for g in shown if not touching[g]}
+    shown = [g for g in shown if not (touching[g] and model.geom_bodyid[g] in adorned)]
     parts = []
     for geom in shown:
         mesh_geom = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
@@ -189,6 +195,7 @@ class Thoughts:
                 np.asarray(robot.points.body_offset, float)[here],
                 batched_scales=radius[here],
                 batched_colors=np.zeros((len(here), 3), np.uint8),
+                opacity=_OPACITY,
                 lod="off",
                 cast_shadow=False,
             )
