@@ -21,7 +21,7 @@ from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot.kinematics import arm_state, site_state
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.learning.networks import OBS_LIMIT, Agent
-from rmp_mjx.training.policy import arrays_of
+from rmp_mjx.training.policy import arrays_of, hidden_biases
 from rmp_mjx.training.runs import run_folder
 
 from .arms import JACO
@@ -70,13 +70,11 @@ def plain(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of a policy as `NumpyPolicy` takes them."""
     found = {name: arrays[f"normalizer/{name}"] for name in ("mean", "std")}
     found["limit"] = np.asarray(OBS_LIMIT, np.float32)
-    kernels = sorted(
-        (k for k in arrays if k.endswith("/kernel")),
-        key=lambda k: ("hidden_" not in k, len(k), k),
-    )
-    for i, name in enumerate(kernels):
-        found[f"W{i}"] = arrays[name]
-        found[f"b{i}"] = arrays[name.replace("/kernel", "/bias")]
+    hidden = hidden_biases(arrays)
+    last = [name for name in arrays if name.endswith("/bias") and name not in hidden]
+    for i, name in enumerate([*hidden, *last]):
+        found[f"W{i}"] = arrays[name.replace("/bias", "/kernel")]
+        found[f"b{i}"] = arrays[name]
     return found
 
 

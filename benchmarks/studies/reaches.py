@@ -17,6 +17,7 @@ import numpy as np
 import rmp_mjx as rmp
 from benchmarks.common import Row, insert, markdown, show, write_json
 from benchmarks.studies.chains import random_chain
+from envs.safety import ROUNDING
 from rmp_mjx import runtime
 from rmp_mjx.check_robot.certificate import certify
 from rmp_mjx.check_robot.reaches import FROM_END, draw_reaches, run_reaches
@@ -26,9 +27,6 @@ CONTROLLERS = {"vices": rmp.VICES, "rmp_vices": rmp.RMPVICES}
 
 PLANAR = "planar3"
 """An arm whose hand has too few joints for the reaches."""
-
-ROUNDING = 1e-3
-"""Share of a speed limit that counts as the limit."""
 
 CHAINS = "chains"
 """Group of the random chains."""

@@ -26,6 +26,7 @@ from rmp_mjx.robot.kinematics import (
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import (
     PointRMP,
+    PointState,
     point_carrier,
     point_state,
     pull_to_joints,
@@ -61,6 +62,21 @@ class Surroundings(NamedTuple):
     """Greatest acceleration of a near point towards an obstacle by contacts [m/s^2]."""
 
 
+def obstacle_gaps(
+    robot: Robot, points: PointState, obstacles: Obstacles
+) -> dict[str, Gap]:
+    """Gaps between every control point and every obstacle slot, by kind.
+
+    Args:
+        robot: The arm.
+        points: Its control points, from `point_state`.
+        obstacles: Padded obstacle slots.
+    """
+    world = points.x + Vec(*base_point(robot))
+    rho = jnp.asarray(robot.points.radius, points.x.x.dtype)
+    return obstacles.gaps(world, points.v, rho, robot.points.hand)
+
+
 def obstacle_branch(
     robot: Robot,
     arm: ArmState,
@@ -86,16 +102,12 @@ def obstacle_branch(
         The RMP on the joints, and what is about.
     """
     points = point_state(robot, arm)
-    origin = base_point(robot)
-    world = points.x + Vec(origin[0], origin[1], origin[2])
-    rho = jnp.asarray(robot.points.radius, arm.p.dtype)
     total, clearance, pressed = None, {}, jnp.zeros((), arm.p.dtype)
     push = None
     if w is not None:
         pushed = select(motion_of(robot, arm.S, w), point_carrier(robot))
         push = pushed.at(points.x).map(lambda c: c[None])
-    gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
-    for kind, gap in gaps.items():
+    for kind, gap in obstacle_gaps(robot, points, obstacles).items():
         clearance[kind] = jnp.min(
             jnp.where(gap.active, gap.distance, jnp.inf), initial=jnp.inf
         )

@@ -9,17 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rmp_mjx.control.avoidance import self_gaps
+from rmp_mjx.control.avoidance import obstacle_gaps, self_gaps
 from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.control.vices import VICES
 from rmp_mjx.math import cholesky, psd_solve, solve_lower
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
-from rmp_mjx.robot.kinematics import ArmState, base_point
+from rmp_mjx.robot.kinematics import ArmState
 from rmp_mjx.robot.model import Robot
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.types import ControlOutput, Setpoint
-from rmp_mjx.vec import Vec
 
 LARGEST = 300.0
 """Largest change that one barrier can demand [sqrt(kg m^2) rad/s^2]."""
@@ -162,16 +161,13 @@ def _points(robot: Robot, arm: ArmState, obstacles: Obstacles) -> Barriers | Non
     if not obstacles.kinds or not robot.points.segment:
         return None
     points = point_state(robot, arm)
-    world = points.x + Vec(*base_point(robot))
-    rho = jnp.asarray(robot.points.radius, arm.p.dtype)
     segment = np.array(robot.points.segment, int)
     moves = np.arange(robot.n)[:, None] <= segment
     spin, shift = (v.map(lambda c: c[:, None]) for v in (arm.S.ang, arm.S.lin))
     x, a = (v.map(lambda c: c[None]) for v in (points.x, points.a))
     J = (shift + spin.cross(x)).map(lambda c: jnp.where(moves, c, 0.0)[None])
     found = []
-    gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
-    for gap in gaps.values():
+    for gap in obstacle_gaps(robot, points, obstacles).values():
         normal = gap.normal.map(lambda c, d=gap.distance: jnp.broadcast_to(c, d.shape))
         rows = normal.map(lambda c: c[:, None]) @ J
         found.append(

@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from rmp_mjx.control.avoidance import capsule_pairs, segment_gap
+from rmp_mjx.control.avoidance import capsule_pairs, obstacle_gaps, segment_gap
 from rmp_mjx.math import psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant, Pytree
@@ -27,7 +27,6 @@ from rmp_mjx.robot.dynamics import holding_torque
 from rmp_mjx.robot.kinematics import (
     ArmState,
     Motion,
-    base_point,
     motion_of,
     select,
 )
@@ -221,9 +220,7 @@ class StopGuard(Pytree):
         V = motion_of(robot, arm.S, w)
         points = point_state(robot, arm)
         at_w = select(V, point_carrier(robot)).at(points.x)
-        rho = jnp.asarray(robot.points.radius, arm.p.dtype)
-        world = points.x + Vec(*base_point(robot))
-        gaps = obstacles.gaps(world, points.v, rho, robot.points.hand)
+        gaps = obstacle_gaps(robot, points, obstacles)
         rows, scallop = [], jnp.asarray(self.bounds.scallop, arm.p.dtype)
         for kind, gap in zip(obstacles.kinds, gaps.values(), strict=True):
             rates = tuple(

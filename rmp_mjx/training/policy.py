@@ -63,7 +63,7 @@ class Policy:
         Raises:
             PolicyError: The policy has other sizes, or arrays are missing.
         """
-        widths = [len(self.arrays[name]) for name in _biases(self.arrays)]
+        widths = [len(self.arrays[name]) for name in hidden_biases(self.arrays)]
         networks = make_networks(observation_size, action_size, tuple(widths), 0.0)
         shape = jax.ShapeDtypeStruct((observation_size,), np.dtype(np.float32))
         template = {
@@ -75,7 +75,7 @@ class Policy:
         return make_agent(networks, normalizer, parts[NETWORK], deterministic)
 
 
-def _biases(arrays: Mapping[str, np.ndarray]) -> list[str]:
+def hidden_biases(arrays: Mapping[str, np.ndarray]) -> list[str]:
     """Names of the hidden layers' biases, in the order of the layers."""
     found = [name for name in arrays if "/hidden_" in name and name.endswith("/bias")]
     return sorted(found, key=lambda name: int(name.split("/hidden_")[1].split("/")[0]))

@@ -18,13 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rmp_mjx.control import RMPVICES
+from rmp_mjx.control.avoidance import obstacle_gaps
 from rmp_mjx.control.leaves import Leaves, leaf_of
 from rmp_mjx.control.torque import stop_time
 from rmp_mjx.math import cholesky, psd_solve, solve_lower
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, arm_state, base_point, site_state
-from rmp_mjx.robot.point_state import point_state
+from rmp_mjx.robot.point_state import PointState, point_state
 from rmp_mjx.types import Setpoint
 from rmp_mjx.vec import Vec
 
@@ -91,7 +92,7 @@ def think(
     if controller.braking_share is not None:
         share, tau_max = controller.braking_share, jnp.asarray(robot.tau_max)
         leaves = leaves.braking(stop_time(Mq, bias - tau_ext, qd, tau_max, share))
-    weight, clearance, gap = _nearest(controller, leaves, world, state.v, obstacles)
+    weight, clearance, gap = _nearest(controller, leaves, world, state, obstacles)
     site = site_state(robot, arm)
     heaviest = jnp.argmax(weight)
     J_point = _point_jacobian(controller, arm, state.x.stack(1)[heaviest], heaviest)
@@ -116,15 +117,18 @@ def think(
 
 
 def _nearest(
-    controller: RMPVICES, leaves: Leaves, world: Array, v: Vec, obstacles: Obstacles
+    controller: RMPVICES,
+    leaves: Leaves,
+    world: Array,
+    points: PointState,
+    obstacles: Obstacles,
 ) -> tuple[Array, Array, Array]:
     """Weights of the control points, the least clearance and the ends of its gap."""
     robot = controller.robot
     rho = jnp.asarray(robot.points.radius, world.dtype)
-    gaps = obstacles.gaps(Vec.of(world), v, rho, robot.points.hand)
     weight = jnp.zeros(len(world), world.dtype)
     clearance, ends = jnp.array(jnp.inf, world.dtype), jnp.zeros((2, 3), world.dtype)
-    for kind, gap in gaps.items():
+    for kind, gap in obstacle_gaps(robot, points, obstacles).items():
         leaf = leaf_of(leaves.collision, kind)
         if leaf is not None:
             m = jnp.where(gap.active, leaf.scalar(gap.distance, gap.rate)[1], 0.0)

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from rmp_mjx.control.avoidance import obstacle_gaps
 from rmp_mjx.math import exp_so3, log_so3, quat_to_mat
 from rmp_mjx.names import unknown
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
-from rmp_mjx.robot.kinematics import arm_state, base_point, site_pose
+from rmp_mjx.robot.kinematics import arm_state, site_pose
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.types import Setpoint
-from rmp_mjx.vec import Vec
 from rmp_mjx.viewer import physics
 from rmp_mjx.viewer.dials import (
     CONTROLLERS,
@@ -351,11 +351,9 @@ def control(
 
     tau, qdd = jax.lax.switch(index, [branch(name) for name in base])
     points = point_state(robot, arm_state(robot, q, qd))
-    rho = jnp.asarray(robot.points.radius, q.dtype)
-    world = points.x + Vec(*base_point(robot))
-    gaps = around.gaps(world, points.v, rho, robot.points.hand)
     nearest = [
-        jnp.min(jnp.where(gap.active, gap.distance, jnp.inf)) for gap in gaps.values()
+        jnp.min(jnp.where(gap.active, gap.distance, jnp.inf))
+        for gap in obstacle_gaps(robot, points, around).values()
     ]
     return tau, qdd, jnp.min(jnp.stack(nearest))
 
