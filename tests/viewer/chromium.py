@@ -22,6 +22,8 @@ ARGUMENTS = [
     "--disable-sync",
 ]
 SIZE = {"width": 1000, "height": 600}
+PATIENCE = 120_000
+"""Milliseconds: a second tab has taken half a minute on two busy cores."""
 
 
 def missing() -> str:
@@ -53,7 +55,13 @@ def running(page) -> Iterator:
     loop.join(20.0)
 
 
-def wait(condition: Callable[[], bool], what: str, seconds: float = 20.0) -> None:
+def drawn(window) -> None:
+    """Wait for the scene: one of the page's canvases has a size."""
+    sized = "[...document.querySelectorAll('canvas')].some(canvas => canvas.width > 0)"
+    window.wait_for_function(sized, timeout=PATIENCE)
+
+
+def wait(condition: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"not within {seconds} s: {what}"

@@ -28,7 +28,7 @@ def main() -> int:
     with chromium.running(page), chromium.browser() as browser:
         window = browser.new_page(viewport={"width": 1200, "height": 640})
         window.goto(page.url)
-        window.wait_for_selector("canvas")
+        chromium.drawn(window)
         window.locator(".mantine-Notification-closeButton").first.click()
         window.get_by_role("tab", name="Tree", exact=True).click()
         target = np.array([0.62, 0.02, 0.42]), session.target[1]

@@ -54,12 +54,13 @@ class Tab:
         self.page, self.faults = page, []
         known = set(page.server.get_clients())
         self.window = browser.new_page(viewport=chromium.SIZE)
+        self.window.set_default_timeout(chromium.PATIENCE)
         self.window.on("console", self._heard)
         self.closed = 0
         self.window.on("websocket", lambda socket: socket.on("close", self._closed))
         self.window.on("pageerror", lambda error: self.faults.append(str(error)))
         self.window.goto(page.url)
-        self.window.wait_for_selector("canvas")
+        chromium.drawn(self.window)
         self.client = self.joined(known)
 
     def joined(self, known):
@@ -149,7 +150,7 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
     page.stop()
     (file,) = tmp_path.glob("*.html")
     tab.window.goto(file.as_uri())
-    tab.window.wait_for_selector("canvas")
+    chromium.drawn(tab.window)
     tab.window.wait_for_timeout(2000)
     assert tab.picture().std() > 5.0 and tab.faults == []
 
