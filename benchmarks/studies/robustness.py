@@ -31,6 +31,7 @@ from benchmarks.studies.sweeps import (
     Results,
     sweep,
 )
+from envs.arms import JACO
 from rmp_mjx import runtime
 
 
@@ -183,9 +184,19 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         action="append",
         help="only this axis and no failures; may be repeated (default: all)",
     )
+    parser.add_argument(
+        "--robot",
+        default=JACO,
+        help="arm, by name or path; another than the Jaco 2 has no axis `armature` "
+        "and no failures",
+    )
     args = parser.parse_args(argv)
+    if args.robot != JACO:
+        args.axis = args.axis or [name for name in AXES if name != "armature"]
+        if "armature" in args.axis:
+            parser.error("--axis armature is for the Jaco 2: leave --robot out")
     if args.axis and (args.plot or args.docs):
-        parser.error("--plot and --docs need all axes: leave --axis out")
+        parser.error("--plot and --docs need all axes: leave --axis and --robot out")
     if args.steps <= REACHING_LIMIT:
         parser.error(f"--steps must exceed {REACHING_LIMIT}, an episode's length")
     return args
@@ -197,7 +208,7 @@ def main(argv: list[str] | None = None) -> None:
     runtime.configure()
     worlds, steps = (4, 320) if args.quick else (args.worlds, args.steps)
     axes = args.axis or tuple(AXES)
-    results = dict(sweep(axes, worlds, steps, args.seed))
+    results = dict(sweep(axes, worlds, steps, args.seed, args.robot))
     rows = [row for key, result in results.items() for row in rows_of(key, result)]
     tables = {name: table(AXES[name], results) for name in axes}
     if not args.axis:
@@ -209,6 +220,7 @@ def main(argv: list[str] | None = None) -> None:
     show(rows, "Where safety ends")
     if args.json:
         settings = {"seed": args.seed, "worlds": worlds, "steps": steps}
+        settings["robot"] = args.robot
         write_json(args.json, rows, **settings)
     if args.plot:
         plot(results, args.plot)

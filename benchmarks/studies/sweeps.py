@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.studies.random_policies import NEAR, REACHING_LIMIT, poisson
 from benchmarks.studies.safety_study import ENDING, Group, Study
+from envs.arms import JACO
 
 CONTROLLERS = {"rmp_vices": "RMP-VICES", "vices": "VICES"}
 """Controllers and their names in the tables."""
@@ -202,7 +203,7 @@ def cells_of(controller: str, axes: Sequence[str]) -> dict[Program, list[Cell]]:
 
 
 def sweep(
-    axes: Sequence[str], worlds: int, steps: int, seed: int
+    axes: Sequence[str], worlds: int, steps: int, seed: int, robot: str = JACO
 ) -> Iterator[tuple[tuple[str, str, str], Outcome | Reaching]]:
     """Run every cell of these axes with both controllers."""
     for controller in CONTROLLERS:
@@ -213,6 +214,7 @@ def sweep(
                 controller,
                 [group for each in groups.values() for group in each],
                 steps,
+                robot=robot,
                 physics="mujoco",
                 sim_dt=program.sim_dt,
                 armature=program.armature,

@@ -31,6 +31,7 @@ from benchmarks.studies import experts
 from benchmarks.studies.parameters import Parameters
 from benchmarks.studies.random_policies import REACHING_LIMIT, poisson
 from benchmarks.studies.safety_study import Group, Study, parts_of, with_parts
+from envs.arms import JACO
 from envs.flags import load_config
 from rmp_mjx import runtime
 from rmp_mjx.training.learning.networks import Agent
@@ -105,9 +106,22 @@ class Bench:
     """All scenes, compiled for one kind of controller."""
 
     def __init__(
-        self, kind: str, worlds: int, steps: int, armature: str, agent: Agent | None
+        self,
+        kind: str,
+        worlds: int,
+        steps: int,
+        agent: Agent | None,
+        **options: Any,
     ):
-        """Build the scenes; `worlds` of each policy run for `steps` policy steps."""
+        """Build the scenes; `worlds` of each policy run for `steps` policy steps.
+
+        Args:
+            kind: Kind of controller.
+            worlds: Worlds of each policy.
+            steps: Policy steps of each.
+            agent: The policy `trained`; None: without it.
+            **options: Of every task, such as the arm.
+        """
         self.studies = {}
         for scene in SCENES:
             groups = [Group(policy, worlds) for policy in scene.policies]
@@ -123,13 +137,11 @@ class Bench:
                 groups,
                 steps,
                 task=scene.task,
-                armature=armature,
                 agent=agent if scene.name == "fixed" else None,
                 **scene.options,
+                **options,
             )
-        self.heavy = envs.load(
-            "door", controller=kind, armature=armature, variant="heavy"
-        )
+        self.heavy = envs.load("door", controller=kind, variant="heavy", **options)
         self._pull = jax.jit(self._play)
 
     def _play(self, parts: dict[str, Any], key: Array) -> dict[str, Array]:
@@ -257,6 +269,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "--report", type=int, default=4, help="number of held-out seeds"
     )
     parser.add_argument("--run", type=Path, help="trajectory run whose policy stalls")
+    parser.add_argument("--robot", default=JACO, help="arm, by name or path")
     parser.add_argument("--armature", default="physical", help="rotor inertias")
     return parser.parse_args(argv)
 
@@ -265,9 +278,10 @@ def main(argv: list[str] | None = None) -> None:
     """Search, report, and write the requested files."""
     args = parse(argv)
     runtime.configure()
-    agent = policy_of(args.run) if args.run else None
+    options = {"robot": args.robot, "armature": args.armature}
+    agent = policy_of(args.run, options) if args.run else None
     benches = {
-        kind: Bench(kind, args.worlds, args.steps, args.armature, agent)
+        kind: Bench(kind, args.worlds, args.steps, agent, **options)
         for kind in ("vices", "rmp_vices")
     }
     baseline = benches["vices"].run(None, SEARCH_SEED)
@@ -318,10 +332,10 @@ def main(argv: list[str] | None = None) -> None:
         args.json.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def policy_of(run: Path) -> Agent:
+def policy_of(run: Path, options: dict[str, Any]) -> Agent:
     """The mean policy of a trajectory run."""
-    config = load_config(run)
-    return load_agent(envs.load("trajectory"), config, run, True, print)[1]
+    config, env = load_config(run), envs.load("trajectory", **options)
+    return load_agent(env, config, run, True, print)[1]
 
 
 def pooled(runs: list[dict[str, Any]]) -> dict[str, Any]:
