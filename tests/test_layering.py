@@ -51,9 +51,10 @@ TRAINING = {
     "config": set(),
     "records": {"config"},
     "stats": set(),
+    "demonstrations": {"config"},
     "learning": {"config"},
     "policy": {"config", "learning"},
-    "runs": {"config", "records", "stats", "learning", "policy"},
+    "runs": {"config", "records", "stats", "learning", "policy", "demonstrations"},
     "evaluation": {"config", "stats", "learning", "policy", "runs"},
     "brax": {"config", "learning", "policy", "runs"},
 }
