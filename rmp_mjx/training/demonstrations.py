@@ -85,14 +85,9 @@ class Demonstrations:
             ConfigError: Task, observations or actions are others.
         """
         here = describe(env, "")
-        names = {
-            "task": (of["task"].get("env") for of in (self.about, here)),
-            **{
-                name: (of[name] for of in (self.about, here))
-                for name in ("observation_size", "action_size", "observation", "action")
-            },
-        }
-        for name, (theirs, own) in names.items():
+        both = [of | {"task": of["task"].get("env")} for of in (self.about, here)]
+        for name in ("task", *WIDE.values(), *WIDE):
+            theirs, own = (of.get(name) for of in both)
             if theirs != own:
                 raise ConfigError(
                     f"the demonstrations are of another {name.replace('_', ' ')}: "

@@ -41,6 +41,7 @@ def clone(
         obs: Observations of the demonstrations.
         action: What was done then, in [-1, 1].
     """
+    obs, action = jnp.asarray(obs), jnp.asarray(action)
     weight = jnp.full(len(obs), max(WEIGHT / len(obs), 1.0))
     normalizer = running_statistics.update(
         state.normalizer, obs, weights=weight, std_min_value=MIN_OBS_STD
