@@ -111,6 +111,10 @@ class Play:
         state = state.replace(data=data, info=state.info | {"spheres": spheres})
         self.now = self.now._replace(state=state)
 
+    def advance(self, state: State, key: Any) -> State:
+        """Where one action of the agent leads."""
+        return self._step(state, key)
+
     def step(self) -> Moment:
         """One policy step; an episode that has ended makes room for the next."""
         before = self.now.state
@@ -118,7 +122,7 @@ class Play:
         if over or float(before.done):
             self.begin()
         steps = self.now.steps + 1
-        state = self._step(self.now.state, jax.random.fold_in(self._key, steps))
+        state = self.advance(self.now.state, jax.random.fold_in(self._key, steps))
         events = dict(self.now.events)
         for name in ("success", "collision", "self_collision", "joint_limit"):
             if float(state.metrics.get(name, 0.0)):

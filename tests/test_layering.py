@@ -70,7 +70,7 @@ COMMAND_LINE = {
     f"envs.{name}"
     for name in [
         *("cli", "deployment", "eval", "export", "flags", "grid", "play", "replay"),
-        *("results", "train", "view"),
+        *("results", "teleoperate", "teleoperation", "train", "view"),
     ]
 }
 
