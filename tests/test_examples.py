@@ -1,6 +1,7 @@
-"""The programs of `docs/examples` run, in small sizes, and do what they say."""
+"""The examples and notebooks run, in small sizes, and do what they say."""
 
 import importlib.util
+import runpy
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from envs import cli, outside, registry
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "examples"
+NOTEBOOKS = FOLDER.parent / "notebooks"
 PROGRAMS = {path.stem for path in FOLDER.glob("*.py")} - {"ros2_node"}
 """All but the node, which tests/deploy/test_ros2.py runs."""
 
@@ -74,3 +76,12 @@ def test_gymnasiums_environment_plays_an_episode_for_stable_baselines3():
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
     assert example("gymnasium_sb3").main(steps=64) > 0.0
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.py")), ids=lambda p: p.stem)
+def test_a_notebook_runs_as_a_script_and_the_page_lists_it(path, tmp_path, monkeypatch):
+    monkeypatch.setenv("RMP_MJX_STEPS", "64")
+    monkeypatch.setenv("RMP_MJX_RUN", str(tmp_path))
+    runpy.run_path(str(path))
+    assert path.read_text().count("# %% [markdown]") > 3
+    assert f"`{path.name}`" in (NOTEBOOKS.parent / "examples.md").read_text()
