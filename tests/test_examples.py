@@ -3,6 +3,7 @@
 import importlib.util
 import runpy
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
@@ -10,6 +11,8 @@ import jax.numpy as jnp
 import pytest
 
 from envs import cli, outside, registry
+from tests.envs import arm_tasks
+from tests.training.conftest import SMALL
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "examples"
 NOTEBOOKS = FOLDER.parent / "notebooks"
@@ -80,8 +83,14 @@ def test_gymnasiums_environment_plays_an_episode_for_stable_baselines3():
 
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.py")), ids=lambda p: p.stem)
 def test_a_notebook_runs_as_a_script_and_the_page_lists_it(path, tmp_path, monkeypatch):
-    monkeypatch.setenv("RMP_MJX_STEPS", "64")
-    monkeypatch.setenv("RMP_MJX_RUN", str(tmp_path))
+    """Training and evaluation are those of a toy task, which is another environment."""
+    arm_tasks.register(monkeypatch)
+    sizes = {n: SMALL[n] for n in ("num_envs", "unroll_length", "num_minibatches")}
+    words = [f"--{name}={value}" for name, value in sizes.items()]
+    monkeypatch.setenv("RMP_MJX_TASK", "counter")
+    monkeypatch.setenv("RMP_MJX_SIZES", " ".join([*words, "--num_timesteps=256"]))
+    monkeypatch.setenv("RMP_MJX_EPISODES", "4")
+    monkeypatch.setattr(tempfile, "mkdtemp", lambda: str(tmp_path))
     runpy.run_path(str(path))
     assert path.read_text().count("# %% [markdown]") > 3
     assert f"`{path.name}`" in (NOTEBOOKS.parent / "examples.md").read_text()

@@ -52,6 +52,7 @@ TRAINING = {
     "records": {"config"},
     "stats": set(),
     "demonstrations": {"config"},
+    "lerobot": {"config", "demonstrations"},
     "learning": {"config"},
     "policy": {"config", "learning"},
     "runs": {"config", "records", "stats", "learning", "policy", "demonstrations"},

@@ -9,8 +9,7 @@
 # %% [markdown]
 # # Train, evaluate and look
 #
-# What `train.py` and `eval.py` do, in a few cells. On two cores the sizes below take
-# about two minutes; `RMP_MJX_STEPS` sets another number of policy steps.
+# What `train.py` and `eval.py` do, in a few cells: about two minutes on two cores.
 
 # %%
 import os
@@ -22,25 +21,18 @@ import polars as pl
 from envs import eval as evaluation
 from envs import train
 
-steps = int(os.environ.get("RMP_MJX_STEPS", "400000"))
-folder = Path(os.environ.get("RMP_MJX_RUN") or tempfile.mkdtemp()) / "run"
+task = os.environ.get("RMP_MJX_TASK", "trajectory")
+sizes = os.environ.get("RMP_MJX_SIZES", "--num_timesteps 400000").split()
+episodes = os.environ.get("RMP_MJX_EPISODES", "100")
+folder = str(Path(tempfile.mkdtemp()) / "run")
 
 # %% [markdown]
 # ## Train
 #
-# The default task: four via points with the Jaco 2 under RMP-VICES.
+# The default task: the Jaco 2 under RMP-VICES visits four via points.
 
 # %%
-flags = [
-    "--num_timesteps",
-    str(steps),
-    "--eval_episodes",
-    "0",
-    "--run_dir",
-    str(folder),
-]
-if steps < 10_000:  # a test
-    flags += ["--num_envs", "8", "--unroll_length", "8", "--controller", "osc"]
+flags = ["--env", task, "--run_dir", folder, "--eval_episodes", "0", *sizes]
 assert train.main(flags) == 0
 
 # %% [markdown]
@@ -49,7 +41,7 @@ assert train.main(flags) == 0
 # Every iteration left a row.
 
 # %%
-rows = pl.read_parquet(folder / "metrics.parquet")
+rows = pl.read_parquet(f"{folder}/metrics.parquet")
 print(rows.select("steps", "episode/return", "episode/success").tail(5))
 
 # %% [markdown]
@@ -58,12 +50,8 @@ print(rows.select("steps", "episode/return", "episode/success").tail(5))
 # Episodes of the mean action, among two spheres that training never saw.
 
 # %%
-episodes = "100" if steps > 10_000 else "2"
-flags = ["--run", str(folder), "--deterministic", "--obstacles", "2", "--no-video"]
-flags += ["--episodes", episodes]
-if steps < 10_000:
-    flags += ["--episode_length", "16"]
-assert evaluation.main(flags) == 0
+flags = ["--run", folder, "--deterministic", "--obstacles", "2", "--no-video"]
+assert evaluation.main([*flags, "--episodes", episodes]) == 0
 
 # %% [markdown]
 # ## Look
@@ -72,5 +60,5 @@ assert evaluation.main(flags) == 0
 # the browser.
 
 # %%
-found = pl.read_parquet(folder / "episodes.parquet")
+found = pl.read_parquet(f"{folder}/episodes.parquet")
 print(found.select("return", "success", "collision", "clearance").head())

@@ -57,10 +57,12 @@ def test_the_hand_follows_the_wish(driven):
     assert np.abs(moved[:2]).max() < 0.01
 
 
-def test_whole_episodes_become_demonstrations_that_train_a_clone(driven):
+def test_whole_episodes_become_demonstrations_that_train_a_clone(driven, monkeypatch):
+    monkeypatch.setattr(cloning, "STEPS", 1000)
     with pytest.raises(ValueError, match="press Record first"):
         driven.keep()
     driven.record()
+    last = driven.now
     for _ in range(8):  # two more than the episode has
         driven.wish = driven.wish._replace(position=driven.wish.position + 0.002)
         last = driven.step()
@@ -94,7 +96,7 @@ def test_whole_episodes_become_demonstrations_that_train_a_clone(driven):
     )
     before, after = (
         make_agent(ppo.networks, s.normalizer, s.learner.policy, True)(
-            found.observation, jax.random.key(0)
+            jnp.asarray(found.observation), jax.random.key(0)
         )
         for s in (state, cloned)
     )

@@ -1,12 +1,13 @@
 """Files of demonstrations: what is written is read, what cannot be used is refused."""
 
 import dataclasses
+import json
 
 import numpy as np
 import polars as pl
 import pytest
 
-from rmp_mjx.training import demonstrations
+from rmp_mjx.training import demonstrations, lerobot
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.demonstrations import Demonstrations
 from tests.training import toys
@@ -86,3 +87,39 @@ def test_another_tasks_environment_is_refused():
     named = made().about | {"observation": [["length", 3]]}
     with pytest.raises(ConfigError, match="another observation: "):
         made(about=named).check(toys.Counter())
+
+
+def test_an_export_has_lerobots_layout_and_every_number(tmp_path):
+    file, folder, shown = tmp_path / "demos.parquet", tmp_path / "set", made()
+    demonstrations.write(file, shown)
+    assert lerobot.main([str(file), str(folder)]) == 0
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"]) == ("v2.1", 20)
+    assert (info["total_episodes"], info["total_frames"]) == (2, 5)
+    assert info["features"]["observation.state"]["shape"] == [3]
+    tables = [
+        pl.read_parquet(folder / info["data_path"].format(episode_chunk=0, **place))
+        for place in ({"episode_index": 0}, {"episode_index": 1})
+    ]
+    whole = pl.concat(tables)
+    assert set(whole.columns) == set(info["features"])
+    assert np.array_equal(whole["observation.state"].to_numpy(), shown.observation)
+    assert np.array_equal(whole["action"].to_numpy(), shown.action)
+    assert whole["index"].to_list() == [0, 1, 2, 3, 4]
+    # float32 of 0.05 s
+    assert np.allclose(tables[1]["timestamp"], [0.0, 0.05, 0.1], atol=1e-7)
+    read = (folder / "meta/episodes.jsonl").read_text().splitlines()
+    length = {"tasks": ["demonstrations"], "length": 3}
+    assert json.loads(read[1]) == {"episode_index": 1} | length
+    read = (folder / "meta/episodes_stats.jsonl").read_text().splitlines()
+    found = json.loads(read[0])["stats"]["action"]
+    assert found["mean"] == pytest.approx([shown.action[:2].mean()])
+    assert found["count"] == [2]
+    assert (folder / "meta/tasks.jsonl").read_text().count("\n") == 1
+
+
+def test_an_export_replaces_nothing(tmp_path, capsys):
+    assert lerobot.main([str(tmp_path / "none"), str(tmp_path / "set")]) == 2
+    demonstrations.write(tmp_path / "demos.parquet", made())
+    assert lerobot.main([str(tmp_path / "demos.parquet"), str(tmp_path)]) == 2
+    assert "exists: name a new folder" in capsys.readouterr().err
