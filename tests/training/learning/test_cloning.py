@@ -26,12 +26,6 @@ def shown(noise=0.0):
     return obs, np.clip(action, -1.0, 1.0).astype(np.float32)
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """A sine needs fewer steps than a task."""
-    monkeypatch.setattr(cloning, "STEPS", 1000)
-
-
 @functools.cache
 def programs():
     config = PPOConfig(num_envs=8, hidden_sizes=(16, 16), num_seeds=2)
