@@ -69,10 +69,15 @@ assert not np.allclose(avoiding.qdd, out.qdd, atol=0.1)
 # Every branch of the tree has a force and a metric. A branch with a large metric is
 # heard.
 
+
 # %%
-arm = arm_state(robot, q, jnp.zeros(robot.n))
-asked = ctrl.asked(arm, setpoint, sphere)
-for name, branch in asked.items():
+@jax.jit
+def asked(q, qd):
+    """What each branch asks of the joints."""
+    return ctrl.asked(arm_state(robot, q, qd), setpoint, sphere)
+
+
+for name, branch in asked(q, jnp.zeros(robot.n)).items():
     print(f"{name:20s} |f| {jnp.linalg.norm(branch.f):8.2f}")
 
 # %% [markdown]
