@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -9,10 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rmp_mjx.control import ACTION_SIZE
+from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.metric import Metric, by_name
 from rmp_mjx.robot.kinematics import SiteState, point_positions
 from rmp_mjx.shapes import Spheres as SphereSlots
 from rmp_mjx.sim import PhysicsState
+from rmp_mjx.types import LeafWeights
 
 from . import sight
 from .options import CTRL_DT
@@ -23,6 +26,13 @@ from .spheres import AWAY, LEVEL, Course, Spheres, draw_count, draw_speed
 from .task import OptionsT
 from .types import METRICS, Measures, State
 from .world import World
+
+PARTS = ("dpos", "drot", "kp_pos", "kp_ori")
+ACTION_NAMES = (
+    *(f"{part}_{axis}" for part in PARTS for axis in "xyz"),
+    *(field.name for field in dataclasses.fields(LeafWeights)),
+)
+"""Entries of an action in [-1, 1]: see `rmp_mjx.Action` and `LeafWeights`."""
 
 TOO_FAST = 1e3
 """A joint velocity beyond this counts as non-finite [rad/s]."""
@@ -46,6 +56,12 @@ class ArmEnv(World[OptionsT]):
     def action_size(self) -> int:
         """Entries of an action in [-1, 1]."""
         return getattr(self.controller, "action_size", ACTION_SIZE)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of an action's entries; none for a controller of another kind."""
+        known = isinstance(self.controller, ImpedanceController)
+        return ACTION_NAMES[: self.action_size] if known else ()
 
     @property
     def episode_length(self) -> int:

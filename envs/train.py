@@ -3,10 +3,12 @@
 import sys
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 
 from rich.console import Console
 
 from rmp_mjx import RobotError, runtime, sim
+from rmp_mjx.training import demonstrations
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.evaluation import evaluate
 from rmp_mjx.training.runs import distributed, run_folder
@@ -66,6 +68,8 @@ def main(args: Sequence[str] | None = None) -> int:
         configs = list(wanted.cells().values()) if wanted else [options.config]
         for config in configs:
             sim.require(config.task.physics)
+            if config.ppo.demos is not None and not config.run.resume:
+                demonstrations.read(Path(config.ppo.demos))
         distributed.join(**vars(options.processes))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -51,9 +51,11 @@ TRAINING = {
     "config": set(),
     "records": {"config"},
     "stats": set(),
+    "demonstrations": {"config"},
+    "lerobot": {"config", "demonstrations"},
     "learning": {"config"},
     "policy": {"config", "learning"},
-    "runs": {"config", "records", "stats", "learning", "policy"},
+    "runs": {"config", "records", "stats", "learning", "policy", "demonstrations"},
     "evaluation": {"config", "stats", "learning", "policy", "runs"},
     "brax": {"config", "learning", "policy", "runs"},
 }
@@ -68,8 +70,8 @@ KNOW_MUJOCO = {"robot", "sim", "check_robot", "viewer"}
 COMMAND_LINE = {
     f"envs.{name}"
     for name in [
-        *("cli", "deployment", "eval", "export", "flags", "grid", "replay", "results"),
-        *("train", "view"),
+        *("cli", "deployment", "eval", "export", "flags", "grid", "play", "replay"),
+        *("results", "teleoperate", "teleoperation", "train", "view"),
     ]
 }
 

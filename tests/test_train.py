@@ -170,6 +170,8 @@ def test_a_grid_trains_every_cell_and_goes_on_where_it_stopped(
         (["--layout", "near"], "'close'"),
         (["--env", "door", "--observation", "fixed"], "--observation"),
         (["--obstacles", "two"], "--obstacles"),
+        (["--demos", "/nonexistent"], "no file of demonstrations /nonexistent"),
+        (["--demos", "README.md"], "README.md is no file of demonstrations"),
         (["--trainer", "brax", "--num_seeds", "2"], "trains one seed"),
         (["--trainer", "brax", "--resume", "/nonexistent"], "no run folder"),
     ],

@@ -139,6 +139,7 @@ def settings(preset: Preset) -> dict[str, Any]:
     config = preset.training
     values = dataclasses.asdict(config.ppo)
     del values["reward_scaling"]  # of another trainer
+    del values["demos"]  # there are none
     if values["final_log_std"] is None:  # nothing is annealed
         del values["final_log_std"], values["anneal_steps"]
     return values | {"num_timesteps": config.run.num_timesteps}

@@ -112,6 +112,8 @@ class PPOConfig:
     falls to it over their last third, from `init_log_std`. None: no bound."""
     anneal_steps: int = 1_500_000
     """Policy steps of an agent after which `final_log_std` holds."""
+    demos: str | None = None
+    """File of demonstrations; the policy starts as a clone of them."""
     reward_scaling: float = 1e-3
     """Factor on the rewards, for trainer brax: ours scales value targets by itself."""
 
@@ -278,6 +280,8 @@ class TrainConfig(Generic[AnyTask]):
             raise ConfigError("trainer brax trains one seed: leave num_seeds out")
         if self.trainer == "brax" and self.ppo.final_log_std is not None:
             raise ConfigError("trainer brax has no final_log_std: leave it out")
+        if self.trainer == "brax" and self.ppo.demos is not None:
+            raise ConfigError("trainer brax clones no demos: leave them out")
         if self.trainer == "brax" and self.ppo.num_envs % self.ppo.num_minibatches:
             raise ConfigError(
                 "trainer brax divides environments into minibatches: num_envs = "

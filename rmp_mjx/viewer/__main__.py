@@ -34,6 +34,13 @@ def main(args: Sequence[str] | None = None) -> int:
             with contextlib.suppress(KeyboardInterrupt):
                 return view.main(flags, options.port, options.out, options.seconds)
             return 0
+        if options.teleoperate is not None:
+            from rmp_mjx_envs import teleoperate
+
+            place = options.port, options.out, options.seconds
+            with contextlib.suppress(KeyboardInterrupt):
+                return teleoperate.main(options.teleoperate, rest, *place)
+            return 0
         if rest:
             raise ValueError(f"unknown: {' '.join(rest)}. See --help")
         runtime.configure()
@@ -65,6 +72,12 @@ def _parser() -> argparse.ArgumentParser:
         "--run",
         help="run, policy file or pretrained/NAME: play it in its task. "
         "Flags of eval.py may follow: --deterministic --obstacles 2",
+    )
+    add(
+        "--teleoperate",
+        metavar="TASK",
+        help="drive a task yourself, and record demonstrations for train.py --demos. "
+        "Flags of the task may follow: --controller vices",
     )
     add("--robot", default="jaco2", help="name of an arm, or path of its model")
     add(

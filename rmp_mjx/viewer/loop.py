@@ -1,4 +1,4 @@
-"""A server for pages, and the loop that serves them."""
+"""A page: a server, what it plays, and the loop that serves it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Generic
 
 import viser
+
+from rmp_mjx.viewer.player import FrameT, Player, Simulation
+from rmp_mjx.viewer.recording import Recording
 
 HOST = "127.0.0.1"
 """A page can be opened from this machine only."""
@@ -16,30 +21,36 @@ FRAMES = 30.0
 """Pictures per second."""
 
 
-class Loop(abc.ABC):
-    """A server, and `run`, which does everything in one thread.
+class Loop(abc.ABC, Generic[FrameT]):
+    """A server and a player, and `run`, which does everything in one thread.
 
     What users do arrives in other threads. It is put into a queue, and the loop obeys
     between two ticks.
     """
 
-    def __init__(self, title: str, port: int):
+    def __init__(
+        self, simulation: Simulation[FrameT], title: str, port: int, folder: Path
+    ):
         """Start the server.
 
         Args:
+            simulation: What is shown.
             title: Heading of the panel.
             port: Where the page is; the next free one if it is taken.
+            folder: Where recordings go.
         """
         self.server = viser.ViserServer(host=HOST, port=port, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.set_panel_label(title)
         self.server.scene.set_up_direction("+z")
+        self.player = Player(simulation)
+        self.recording = Recording(self.server, folder)
         self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stop = threading.Event()
 
     @abc.abstractmethod
-    def tick(self, elapsed: float) -> None:
-        """Do what is due after so much wall time [s]."""
+    def draw(self, frame: FrameT) -> None:
+        """Show a frame in all browsers."""
 
     @abc.abstractmethod
     def refuse(self, error: ValueError) -> None:
@@ -53,6 +64,15 @@ class Loop(abc.ABC):
     def order(self, what: Callable[[], None]) -> None:
         """Let the loop do something between two steps; for other threads."""
         self._orders.put(what)
+
+    def tick(self, elapsed: float) -> None:
+        """Simulate what the wall clock asks for, and draw it.
+
+        Args:
+            elapsed: Wall time since the last call [s].
+        """
+        self.draw(self.player.advance(elapsed))
+        self.recording.tick(1.0 / FRAMES)
 
     def run(self, seconds: float | None = None) -> None:
         """Obey and tick until `stop`, or for so long [s]."""

@@ -12,13 +12,10 @@ from rmp_mjx.viewer import drawing, physics, texts
 from rmp_mjx.viewer.charts import Charts
 from rmp_mjx.viewer.dial_panel import DialPanel
 from rmp_mjx.viewer.drive_panel import DrivePanel
-from rmp_mjx.viewer.loop import FRAMES
-from rmp_mjx.viewer.session import PERIOD, Frame, Session
+from rmp_mjx.viewer.session import Frame, Session
 from rmp_mjx.viewer.stage import Stage
 from rmp_mjx.viewer.thing_panel import ThingPanel
 
-LATE = 0.1
-"""Time that is made up for at most; what is later is lost [s]."""
 _SLOW = 6
 """Bars and charts change with every so many pictures."""
 GHOSTS = ((235, 120, 30), (60, 160, 80), (150, 80, 190))
@@ -48,32 +45,11 @@ class Page(Stage):
         """
         self.show = show
         super().__init__(session, robot, port, folder)
-        self.pace, self.pictures, self._owed = 0.0, 0, 0.0
+        self.pictures = 0
         self._data = mujoco.MjData(session.model)
         self._dragging = False
         self._shown_target = session.target
         self._build()
-
-    def tick(self, elapsed: float) -> None:
-        """Simulate what the wall clock asks for, and draw it.
-
-        Args:
-            elapsed: Wall time since the last call [s].
-        """
-        if not self.paused:
-            self._owed += min(elapsed, LATE) * self.speed
-            steps = int(self._owed / PERIOD)
-            self._owed -= steps * PERIOD
-            for _ in range(steps):
-                self.frame = self.session.step()
-            made = steps * PERIOD / max(elapsed, 1e-6)
-            self.pace += 0.05 * (made - self.pace)
-        elif self.back and self.session.history:
-            ago = min(round(self.back / PERIOD), len(self.session.history) - 1)
-            self.frame = self.session.history[-1 - ago]
-        if self.frame is None:
-            self.frame = self.session.step()
-        self.draw(self.frame)
 
     def refuse(self, error: ValueError) -> None:
         """Say why an order is not obeyed."""
@@ -95,11 +71,11 @@ class Page(Stage):
                 self._shown_target = frame.target
             if self.pictures % _SLOW == 0:
                 self.bars.content = texts.bars(insight, frame.controllers[0])
-                self.drive.say(texts.status(frame, self.pace))
+                self.drive.say(texts.status(frame, self.player.pace))
             if self.pictures % _SLOW == _SLOW // 2:
                 with self._chart_tab:
                     self.charts.show(list(self.session.history))
-        self.recording.tick(1.0 / FRAMES)
+        self.drive.clock.show()
         self.pictures += 1
 
     def _build(self) -> None:
@@ -153,8 +129,9 @@ class Page(Stage):
 
     def _aim(self, place: tuple[np.ndarray, np.ndarray]) -> None:
         self.session.target = place
-        if self.frame is not None and self.paused:
-            self.frame = self.frame._replace(target=place)
+        shown = self.player.shown
+        if shown is not None and self.player.paused:
+            self.player.shown = shown._replace(target=place)
 
     def _fit_arms(self, count: int) -> None:
         """As many arms in the scene as in the frame."""

@@ -32,12 +32,11 @@ from rmp_mjx.viewer.dials import (
     turned,
 )
 from rmp_mjx.viewer.insight import Insight, on_host, think
+from rmp_mjx.viewer.player import kept
 from rmp_mjx.viewer.things import SCENES, SLOTS, Thing, obstacles
 
 PERIOD = 0.005
 """Physics and control timestep [s]."""
-REMEMBERED = 30.0
-"""Length of the history [s]."""
 LEAD = (0.05, 0.2)
 """The set-point is at most so far ahead of the hand [m, rad], as a policy's is."""
 KP = 150.0
@@ -84,6 +83,8 @@ class Frame(NamedTuple):
 class Session:
     """The arms, all from the same start, target and things, one for each controller."""
 
+    period = PERIOD
+
     def __init__(
         self, robot: Robot, controllers: Sequence[str] = ("rmp_vices",), scene="free"
     ):
@@ -101,9 +102,7 @@ class Session:
         self.push: tuple[str, np.ndarray] | None = None
         self.things: tuple[Thing, ...] = ()
         self._made: tuple[Any, Obstacles] | None = None
-        self.history: collections.deque[Frame] = collections.deque(
-            maxlen=round(REMEMBERED / PERIOD)
-        )
+        self.history: collections.deque[Frame] = collections.deque(maxlen=kept(PERIOD))
         self._control = jax.jit(functools.partial(control, self.base))
         self._think = {
             n: jax.jit(functools.partial(_thought, self.base[n])) for n in _TREES

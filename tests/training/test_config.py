@@ -69,6 +69,7 @@ CONFIG = TrainConfig(Task())
         ({"resume": "a", "overwrite": True}, "exclude each other"),
         ({"trainer": "brax", "resume": "a"}, "brax cannot resume"),
         ({"trainer": "brax", "num_seeds": 2}, "trains one seed"),
+        ({"trainer": "brax", "demos": "x"}, "brax clones no demos"),
         ({"trainer": "brax", "final_log_std": -2.0}, "brax has no final_log_std"),
         ({"anneal_steps": 0}, "anneal_steps must be at least 1"),
     ],

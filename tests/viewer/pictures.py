@@ -34,7 +34,7 @@ def main() -> int:
         target = np.array([0.62, 0.02, 0.42]), session.target[1]
         page.order(lambda: setattr(session, "target", target))
         window.wait_for_timeout(4000)
-        page.order(page.drive._pause)
+        page.order(page.drive.clock.toggle)
         window.wait_for_timeout(3000)
         with tempfile.TemporaryDirectory() as folder:
             shot = Path(folder) / "shot.png"

@@ -41,6 +41,11 @@ def page(session, tmp_path):
         yield page
 
 
+def _arm(page):
+    """The numbers of the arm that is shown."""
+    return page.player.shown.arms[0]
+
+
 def _idle(tab):
     """Let the browser's events arrive."""
     tab.window.wait_for_timeout(50)
@@ -131,17 +136,17 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
     tab.click("Things", "tab")
     tab.click("Add sphere")
     chromium.wait(lambda: len(session.things) == 1, "a sphere")
-    chromium.wait(lambda: np.isfinite(page.frame.arms[0].clearance), "a clearance")
+    chromium.wait(lambda: np.isfinite(_arm(page).clearance), "a clearance")
     ahead = session.target[0] + np.array([0.0, 0.02, 0.12])
     page.order(lambda: session.set_things([session.things[0].put(ahead)]))
     tab.window.wait_for_timeout(1500)
-    assert page.frame.arms[0].force == 0.0 and page.frame.arms[0].clearance > 0.0
+    assert _arm(page).force == 0.0 and _arm(page).clearance > 0.0
 
     tab.click("Drive", "tab")
     tab.choose("Controller", "vices")
-    chromium.wait(lambda: page.frame.controllers == ("vices",), "another controller")
-    chromium.wait(lambda: page.frame.arms[0].force > 1.0, "VICES hits the sphere")
-    assert not page.paused and page.pace > 0.5
+    chromium.wait(lambda: session.controllers == ("vices",), "another controller")
+    chromium.wait(lambda: _arm(page).force > 1.0, "VICES hits the sphere")
+    assert not page.player.paused and page.player.pace > 0.5
 
     tab.click("Stop and save")
     chromium.wait(lambda: list(tmp_path.glob("*.html")) != [], "a recording")
@@ -159,11 +164,11 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
 def test_two_tabs_show_the_same_through_a_reload_and_an_end(tabs, page):
     first, second = tabs(), tabs()
     first.click("Pause")
-    chromium.wait(lambda: page.paused, "a pause")
+    chromium.wait(lambda: page.player.paused, "a pause")
     second.window.get_by_role("button", name="Go on", exact=True).first.wait_for()
     first.window.reload()
     first.window.get_by_role("button", name="Go on", exact=True).first.click()
-    chromium.wait(lambda: not page.paused, "the end of the pause")
+    chromium.wait(lambda: not page.player.paused, "the end of the pause")
     second.window.wait_for_timeout(300)
     assert first.faults == [] == second.faults
     page.stop()
@@ -174,17 +179,17 @@ def test_two_tabs_show_the_same_through_a_reload_and_an_end(tabs, page):
 def test_paused_users_step_scrub_and_go_on_from_the_past(page):
     drive, session = page.drive, page.session
     chromium.wait(lambda: session.time > 1.0, "a second of history")
-    page.order(drive._pause)
-    chromium.wait(lambda: page.paused, "a pause")
+    page.order(drive.clock.toggle)
+    chromium.wait(lambda: page.player.paused, "a pause")
     time = session.time
-    page.order(drive._once)
+    page.order(drive.clock.step_once)
     chromium.wait(lambda: session.time > time, "a step")
     assert session.time == pytest.approx(time + 0.005)
-    drive.back.value = 0.5
-    chromium.wait(lambda: page.frame.time < time - 0.4, "the past")
-    past = page.frame.time
-    page.order(drive._again)
-    chromium.wait(lambda: not page.paused, "the end of the pause")
+    drive.clock.back.value = 0.5
+    chromium.wait(lambda: page.player.shown.time < time - 0.4, "the past")
+    past = page.player.shown.time
+    page.order(drive.clock.go_on_from_there)
+    chromium.wait(lambda: not page.player.paused, "the end of the pause")
     assert past < session.time < time
 
 

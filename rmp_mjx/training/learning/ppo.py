@@ -41,6 +41,8 @@ from rmp_mjx.training.learning.networks import (
 from rmp_mjx.training.learning.update import Update, in_groups
 from rmp_mjx.trees import cast_like
 
+HELD = 10
+"""Iterations for which a cloned policy stays as it is."""
 MIN_OBS_STD = 1e-3
 """Floor on the deviation of an observation that hardly varies."""
 
@@ -109,7 +111,8 @@ class PPO:
         """Learn from what was gathered.
 
         The first iteration only measures the observations: networks are not updated on
-        observations that are not normalized.
+        observations that are not normalized. A policy that was cloned waits for a value
+        function that knows it: advantages of another one would ruin it.
 
         Returns:
             The state with all but its environments moved on, and the learner's metrics.
@@ -127,8 +130,11 @@ class PPO:
             value=value_scale.rescale_output(state.learner.value, state.scale, scale)
         )
         update = Update(self.networks, self.optimizers, self.config)
+        begun = state.iteration > 0
+        held = self.config.demos is not None
+        policy_may = state.iteration > HELD if held else True
         learner, learned = update(
-            learner, state.normalizer, batch, key_learn, state.iteration > 0
+            learner, state.normalizer, batch, key_learn, begun, policy_may
         )
         learner = self.annealed(learner, state.iteration + 1)
         std = self.action_std(state.normalizer, learner, data.obs[0, :1])

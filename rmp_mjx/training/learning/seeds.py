@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Key
 
 from rmp_mjx.training.config import PPOConfig
-from rmp_mjx.training.learning import devices
+from rmp_mjx.training.learning import cloning, devices
 from rmp_mjx.training.learning.learner import TrainState
 from rmp_mjx.training.learning.ppo import PPO, make_ppo
 from rmp_mjx.training.learning.rollout import Env
@@ -30,6 +30,9 @@ class Programs(NamedTuple):
     """The devices."""
     init: Callable[[Any], TrainState]
     """First state, from the seeds' keys."""
+    clone: Callable[[TrainState, Any, Any], TrainState]
+    """`cloning.clone`: all seeds imitate the same observations and actions; consumes
+    the state."""
     gather: Callable[[TrainState], Any]
     """`PPO.gather`; consumes the state."""
     learn: Callable[[TrainState, Any], Any]
@@ -58,6 +61,7 @@ def programs(env: Env, config: PPOConfig, num_devices: int | None = None) -> Pro
     ppo = make_ppo(env, config, mesh)
     seeded = int(config.num_seeds > 1)
     many = jax.vmap if seeded else lambda function: function
+    clone = partial(cloning.clone, ppo)
     whole = devices.placed(mesh, None)
     shardings: dict[str, Any] = {f.name: whole for f in dataclasses.fields(TrainState)}
     shardings["rollout"] = devices.placed(mesh, seeded)
@@ -67,6 +71,11 @@ def programs(env: Env, config: PPOConfig, num_devices: int | None = None) -> Pro
         ppo=ppo,
         mesh=mesh,
         init=jax.jit(many(ppo.init), out_shardings=state),
+        clone=jax.jit(
+            jax.vmap(clone, (0, None, None)) if seeded else clone,
+            donate_argnums=0,
+            out_shardings=state,
+        ),
         gather=jax.jit(
             many(ppo.gather), donate_argnums=0, out_shardings=(state, data, whole)
         ),

@@ -115,6 +115,7 @@ class Update:
         batch: Batch,
         key: PRNGKeyArray,
         may_update: Bool[Array, ""],
+        policy_may: Bool[Array, ""] | bool = True,
     ) -> tuple[Learner, Metrics]:
         """All passes over the batch.
 
@@ -124,12 +125,13 @@ class Update:
             batch: The data, (groups, rows) leading.
             key: Randomness of the orders.
             may_update: Whether anything moves.
+            policy_may: Whether the policy moves then.
 
         Returns:
             The learner, and means over all minibatches; `kl` is that of the last pass,
             `policy_epochs` and `skipped_updates` are counts.
         """
-        progress = Progress(learner, may_update, jnp.bool_(True))
+        progress = Progress(learner, may_update, jnp.bool_(policy_may))
         progress, parts = jax.lax.scan(
             lambda progress, key: self.epoch(normalizer, batch, progress, key),
             progress,

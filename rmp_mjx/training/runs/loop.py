@@ -10,7 +10,9 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
+from rmp_mjx.training import demonstrations
 from rmp_mjx.training.config import TrainConfig
+from rmp_mjx.training.demonstrations import Demonstrations
 from rmp_mjx.training.learning import seeds
 from rmp_mjx.training.learning.learner import TrainState
 from rmp_mjx.training.learning.networks import Agent, make_agent
@@ -72,6 +74,7 @@ def train(
     if config.run.resume:
         identity.check(identity.saved(folder / run_folder.CONFIG), env, folder)
         run_id = identity.run_id(folder / run_folder.CONFIG)
+    demos = _demonstrations(env, config, folder)
     programs = seeds.programs(env, config.ppo, config.run.num_devices)
     seeds.check_memory(programs, config.ppo)
     announce = partial(
@@ -80,7 +83,7 @@ def train(
     if not config.run.resume:
         announce()
     checkpoints = _open_checkpoints(config, folder, run_id)
-    state, first = _start(programs, config, checkpoints, console)
+    state, first = _start(programs, config, checkpoints, demos, console)
     if config.run.resume:  # a run that cannot go on stays as it is
         announce()
     primary = distributed.is_primary()
@@ -223,10 +226,23 @@ def _announce(
         console.print(f"not an exact continuation: {', '.join(changes)}", markup=False)
 
 
+def _demonstrations(
+    env: Env, config: TrainConfig, folder: Path
+) -> Demonstrations | None:
+    """What the policy starts from: the file that is named, or a resumed run's copy."""
+    if config.ppo.demos is None:
+        return None
+    copy = folder / run_folder.DEMOS
+    found = demonstrations.read(copy if config.run.resume else Path(config.ppo.demos))
+    found.check(env)
+    return found
+
+
 def _start(
     programs: seeds.Programs,
     config: TrainConfig,
     checkpoints: Checkpointer | None,
+    demos: Demonstrations | None,
     console: Console,
 ) -> tuple[TrainState, int]:
     """The first state, new or restored, and its finished iterations."""
@@ -235,7 +251,13 @@ def _start(
         console.print(f"{config.run.resume} has no checkpoint yet and begins anew")
     if checkpoints is None or not config.run.resume or nothing:
         # donation wants distinct buffers
-        return programs.place(programs.init(seeds.keys(config.ppo))), 0
+        state = programs.place(programs.init(seeds.keys(config.ppo)))
+        if demos is None:
+            return state, 0
+        console.print(
+            f"cloning {demos.episodes} demonstrations, {len(demos.step):,} steps"
+        )
+        return programs.clone(state, demos.observation, demos.action), 0
     done, state = checkpoints.restore(
         seeds.shapes(programs.ppo, config.ppo), console.print
     )

@@ -18,7 +18,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-from rmp_mjx.files import read_json, write_text
+from rmp_mjx.files import read_json, replacing, write_text
 from rmp_mjx.training.config import ConfigError, TrainConfig
 from rmp_mjx.training.records import (
     RecordedTask,
@@ -35,6 +35,7 @@ METRICS = "metrics.parquet"
 CHECKPOINTS = "checkpoints"
 POLICY = "policy.safetensors"
 TENSORBOARD = "tensorboard"
+DEMOS = "demos.parquet"
 NONFINITE = "nonfinite"
 TRACKED = ("wandb_run", "mlflow_run", "wandb")
 CURVE = "learning_curve.png"
@@ -67,6 +68,7 @@ RESULTS = (
     METRICS,
     CHECKPOINTS,
     POLICY,
+    DEMOS,
     TENSORBOARD,
     NONFINITE,
     *TRACKED,
@@ -235,6 +237,9 @@ def describe(
         bit-identical to an uninterrupted one only where this is empty.
     """
     identities = {identity.KEY: identity.of(env), identity.RUN: run_id}
+    if config.ppo.demos and not (folder / DEMOS).exists():
+        with replacing(folder / DEMOS) as copy:
+            shutil.copyfile(config.ppo.demos, copy)
     save_config(config, folder / CONFIG, **identities)
     history, now = _history(folder), versions()
     write_text(folder / VERSIONS, json.dumps([*history, now], indent=2) + "\n")

@@ -7,11 +7,14 @@ import shutil
 import signal
 
 import jax
+import numpy as np
 import polars as pl
 import pytest
 from rich.console import Console
 
+from rmp_mjx.training import demonstrations
 from rmp_mjx.training.config import ConfigError
+from rmp_mjx.training.demonstrations import Demonstrations
 from rmp_mjx.training.records import config_of, read_record
 from rmp_mjx.training.runs import loop as train_module
 from rmp_mjx.training.runs import run_folder
@@ -38,6 +41,36 @@ def test_a_run_leaves_its_configuration_versions_metrics_and_checkpoints(finishe
     assert rows["steps"].to_list() == [64, 128, 192, 256]
     assert list((folder / run_folder.TENSORBOARD).glob("events*"))
     assert newest_state(folder, config)[0] == ITERATIONS
+
+
+def test_a_run_from_demonstrations_keeps_them_and_resumes_bit_identically(tmp_path):
+    file, toy = tmp_path / "demos.parquet", toys.Counter()
+    rng = np.random.default_rng(0)
+    rows = {
+        "episode": np.zeros(9, int),
+        "step": np.arange(9),
+        "observation": rng.normal(size=(9, 3)),
+        "action": rng.uniform(-1.0, 1.0, (9, 1)),
+        "reward": np.zeros(9),
+        "done": np.zeros(9, bool),
+        "success": np.zeros(9, bool),
+    }
+    about = demonstrations.describe(toy, "a test")
+    demonstrations.write(file, Demonstrations(**rows, about=about))
+    whole, half = tmp_path / "whole", tmp_path / "half"
+    _, config = run(whole, demos=str(file))
+    run(half, demos=str(file), num_timesteps=config.ppo.steps_per_iteration * 2)
+    copied = (whole / run_folder.DEMOS).read_bytes()
+    assert copied == file.read_bytes()
+    file.unlink()  # the run has its own
+    run(half, run_dir=None, resume=str(half), demos=str(file))
+    for one, two in zip(
+        *(jax.tree.leaves(newest_state(f, config)[1]) for f in (whole, half)),
+        strict=True,
+    ):
+        assert bits(one) == bits(two)
+    with pytest.raises(ConfigError, match="no file of demonstrations"):
+        run(tmp_path / "other", demos=str(file))
 
 
 def test_a_terminated_and_resumed_run_is_bit_identical(finished, tmp_path, monkeypatch):
