@@ -9,6 +9,7 @@ late 20 times (a *reflex*); `recover` clears that.
 from __future__ import annotations
 
 import importlib
+import time
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +23,8 @@ AXIS_ERROR = 0.01
 TORQUE, FORCE = 40.0, 60.0
 """Thresholds of the robot's own collision reflex [N m; N, N m], above what the
 controller's contacts cause and below what hurts the arm."""
+AT_ONCE = 5e-5
+"""A state that is there within this time has waited for us [s]."""
 
 
 class WrongRobotError(ValueError):
@@ -76,6 +79,9 @@ class FrankaBackend:
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """The robot's next state; the first call starts torque control.
 
+        A state that has waited while the loop was late is let go: the answer to it
+        would be late again, and so would all that follow.
+
         Raises:
             pylibfranka.FrankaException: The robot has stopped itself.
         """
@@ -85,7 +91,10 @@ class FrankaBackend:
             )
             self._control = self.robot.start_torque_control()
         try:
+            called = time.perf_counter()
             state, _ = self._control.readOnce()
+            if time.perf_counter() - called < AT_ONCE:
+                state, _ = self._control.readOnce()
         except Exception:
             self._control = None
             raise
