@@ -385,9 +385,8 @@ def main() -> int:
         demo.close()
     rows = found["episodes"]
     shows = {k: found[k] for k in ("wrong_robot", "hold", "stale", "reflex")}
-    aborts = [
-        why for show in (*shows.values(), *rows) for why in show.get("aborts", ())
-    ]
+    every = (*shows.values(), *rows)
+    aborts = [why for show in every for why in show.get("aborts", ())]
     causes = {why: aborts.count(why) for why in sorted(set(aborts))}
     print(table(rows))
     for name, show in shows.items():
