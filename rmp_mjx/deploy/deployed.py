@@ -156,8 +156,7 @@ class Deployed:
             obstacles: Obstacles, batched.
 
         Raises:
-            ValueError: The task's observation is not made of these alone: the caller
-                gives it.
+            ValueError: The task's observation is not made of these alone.
         """
         self.check_observes()
         return self._jitted["observe"](*_floats(q, qd), told, obstacles)
@@ -170,9 +169,9 @@ class Deployed:
         """
         if "observe" not in self.programs:
             raise ValueError(
-                f"the observation of task '{self.metadata['task']}' has positions of "
-                "objects, which an arm does not measure: make it yourself, entry by "
-                "entry as metadata['observation'] lists them"
+                f"the observation of task '{self.metadata['task']}' takes more than "
+                "joints and what can be told: make it yourself, entry by entry as "
+                "metadata['observation'] lists them"
             )
 
     def setpoint(self, q: Any, action: Any, time: Any) -> dict[str, Any]:

@@ -130,7 +130,8 @@ class Loop:
             hold: Hold the arm for so long before the loop ends [s].
 
         Raises:
-            ValueError: The first state is not one to start from.
+            ValueError: The first state is not one to start from. What the targets raise
+                at the start is raised, too.
         """
         collecting = gc.isenabled()
         gc.collect()
