@@ -85,7 +85,6 @@ class PolicyTargets:
         Raises:
             ValueError: The file has no `observe`.
         """
-        deployed.check_observes()
         self.task = task
         self._grip, self._plan = deployed.flat("grip"), deployed.flat_plan()
 
@@ -98,7 +97,7 @@ class PolicyTargets:
         told = self.task.told(self._grip()["p"], time)
         for place, value in enumerate((q, qd, told, seen.slots, np.float32(time))):
             self._plan.put(place, value)
-        return self._plan()["setpoint"]
+        return self._plan()
 
 
 class ReachTargets:

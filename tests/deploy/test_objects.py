@@ -137,6 +137,16 @@ def test_an_observation_of_more_than_joints_is_left_to_the_caller(door, monkeypa
     assert observe_program(door.env, {}) is None
 
 
+def test_a_file_without_an_observation_says_what_to_do(file, world):
+    bare = copy.copy(file)
+    bare.programs = {k: v for k, v in file.programs.items() if k != "observe"}
+    message = "task 'door' takes more .* make it yourself"
+    with pytest.raises(ValueError, match=message):
+        deploy.PolicyTargets(bare, world.objects)
+    with pytest.raises(ValueError, match=message):
+        deploy.Objects(bare, world.source)
+
+
 def test_objects_that_nobody_reports_any_more_stop_the_arm(file, world):
     """Silent from 0.6 s on, and stale 0.25 s later; policy steps come 0.05 s apart."""
     arm = MujocoBackend(world.model, world.data, 7, period=0.005)
