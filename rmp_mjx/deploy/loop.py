@@ -187,8 +187,7 @@ class Loop:
             last = now
             if done:
                 return
-            passed = pilot.ticks * period
-            if self._stop.is_set() or passed >= seconds or until():
+            if self._stop.is_set() or pilot.time + period >= seconds or until():
                 pilot.stop()
 
     def _lost(self, error: Exception) -> None:

@@ -167,7 +167,7 @@ def test_no_set_point_stops_the_arm(make):
 
     def targets(q, qd, time, seen):
         calls.append(time)
-        if time > 0.2:
+        if time > 0.21:
             raise RuntimeError("the planner died")
         return deploy_targets(q, qd, time, seen)
 
@@ -293,18 +293,18 @@ def test_the_observer_feels_what_the_table_gives_a_hand_that_presses(deployed, t
     model.opt.timestep = 0.001
     data = mujoco.MjData(model)
     data.qpos[:] = trained.env.robot.q_home
-    arm, acted = MujocoBackend(model, data, 7), []
+    arm, forces = MujocoBackend(model, data, 7), []
 
     def write(tau):
         arm.write(tau)
-        acted.append(data.qfrc_constraint.copy())
+        forces.append(data.qfrc_constraint.copy())
 
     backend = deploy.CallbackBackend(arm.read, write, pace="simulation")
     down = deploy.ReachTargets(deployed, deployed.start, stiffness=400.0)
     down.goal["p"][2] = -0.17  # the table's top is at -0.112 m
     loop = deploy.Loop(deployed, backend, down, watchdog=NEVER)
     assert loop.run(1.8).reason is None
-    felt, acted = loop.log.columns()["tau_ext"][:1800], np.array(acted)[:1800]
+    felt, acted = loop.log.columns()["tau_ext"][:1800], np.array(forces)[:1800]
     assert np.max(np.abs(acted)) > 20.0  # it does press [N m]
     share, low = -np.expm1(-100.0 * 0.001), np.zeros_like(acted)
     for k in range(1, len(acted)):

@@ -115,9 +115,9 @@ def test_what_is_told_makes_the_environments_observation_and_obstacles(task, doo
     assert set(found[1][2]) == told and set(boxes[1][0]) == set(joints)
     known = {k: x for k, x in (joints | state.task).items() if k in told}
     site = env.site(data)
-    wanted = env.assemble(
-        site, data.qpos[:7], env.observe(data, site, state.task), lambda: None
-    )
+    none = Obstacles.empty().spheres
+    values = env.observe(data, site, state.task)
+    wanted = env.assemble(site, data.qpos[:7], values, lambda: none)
     seen = found[0](data.qpos[:7], rates[:7], known, {})
     np.testing.assert_allclose(seen, wanted, atol=1e-6)
     slots = env.fixtures(Obstacles.empty(**env.fixture_slots), data).boxes
