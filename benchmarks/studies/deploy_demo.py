@@ -138,12 +138,12 @@ class Demo:
         deploy.relax()
         self.close()
         self.server = Server(self.options)
-        self.robot = FrankaBackend(self.deployed, ADDRESS, realtime=False)
+        self.robot = FrankaBackend(self.deployed, ADDRESS, realtime=False, ahead=True)
         self.urgent = deploy.hurry() and self.server.urgent
 
     def close(self) -> None:
-        """End the server."""
-        if self.server is not None:
+        """End the server, if there is one."""
+        if self.server:
             self.server.stop()
 
     def source(self, sphere: np.ndarray | None = None) -> deploy.ObstacleSource:
@@ -378,11 +378,8 @@ def main() -> int:
     runtime.configure(async_dispatch=False)
     options.folder.mkdir(parents=True, exist_ok=True)
     (options.folder / "server.log").unlink(missing_ok=True)
-    demo = Demo(options)
-    try:
+    with contextlib.closing(Demo(options)) as demo:
         found = demo.all()
-    finally:
-        demo.close()
     rows = found["episodes"]
     shows = {k: found[k] for k in ("wrong_robot", "hold", "stale", "reflex")}
     every = (*shows.values(), *rows)

@@ -39,7 +39,13 @@ class FrankaBackend:
     carries_weight = True
     """Gravity is the robot's own affair."""
 
-    def __init__(self, deployed: Deployed, address: str, realtime: bool = True):
+    def __init__(
+        self,
+        deployed: Deployed,
+        address: str,
+        realtime: bool = True,
+        ahead: bool = False,
+    ):
         """Connect, and see that it is the robot of the file. Nothing moves.
 
         Args:
@@ -47,6 +53,9 @@ class FrankaBackend:
             address: Of the robot, for instance 172.16.0.2.
             realtime: Whether to insist on a real-time kernel; without one, the robot
                 stops now and then.
+            ahead: Whether a torque answers the state after the one that it is for. It
+                is then there at once, a millisecond late for the controller: for a
+                machine that needs most of a millisecond for it.
 
         Raises:
             ImportError: pylibfranka is not installed.
@@ -64,6 +73,7 @@ class FrankaBackend:
             address, config.kEnforce if realtime else config.kIgnore
         )
         self._control: Any = None
+        self._ahead, self._waiting = ahead, None
         _check_pose(deployed, self.robot.read_once())
 
     def recover(self) -> None:
@@ -89,12 +99,15 @@ class FrankaBackend:
             self.robot.set_collision_behavior(
                 [TORQUE] * JOINTS, [TORQUE] * JOINTS, [FORCE] * 6, [FORCE] * 6
             )
+            self._waiting = None
             self._control = self.robot.start_torque_control()
         try:
             called = time.perf_counter()
             state, _ = self._control.readOnce()
             if time.perf_counter() - called < AT_ONCE:
                 state, _ = self._control.readOnce()
+            if self._waiting is not None:
+                self._control.writeOnce(self._waiting)
         except Exception:
             self._control = None
             raise
@@ -102,8 +115,12 @@ class FrankaBackend:
 
     def write(self, tau: np.ndarray) -> None:
         """Send torques without gravity, (7,) [N m]."""
+        torques = self._franka.Torques(tau.tolist())
+        if self._ahead:
+            self._waiting = torques
+            return
         try:
-            self._control.writeOnce(self._franka.Torques(tau.tolist()))
+            self._control.writeOnce(torques)
         except Exception:
             self._control = None
             raise

@@ -132,6 +132,21 @@ def test_a_state_that_has_waited_is_let_go(deployed, bindings, monkeypatch):
     assert bindings.reads == 3
 
 
+def test_ahead_a_torque_answers_the_next_state(deployed, bindings):
+    backend = FrankaBackend(deployed, "x", ahead=True)
+    for k in range(3):
+        assert len(bindings.sent) == max(k - 1, 0)
+        backend.read()
+        backend.write(np.full(7, float(k)))
+    backend.finish(np.full(7, 9.0))
+    assert [torques.tau[0] for torques in bindings.sent] == [0.0, 1.0, 9.0]
+    assert [torques.motion_finished for torques in bindings.sent] == [
+        False,
+        False,
+        True,
+    ]
+
+
 def test_a_robot_whose_tool_is_elsewhere_is_refused(deployed, bindings):
     bindings.axis_error = np.array([0.0, 0.03, 0.0])
     with pytest.raises(WrongRobotError, match=r"3\.0 cm from it"):
