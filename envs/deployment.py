@@ -16,9 +16,8 @@ from rmp_mjx.deploy import artefact
 from rmp_mjx.deploy.card import card
 from rmp_mjx.deploy.numpy_policy import WEIGHTS
 from rmp_mjx.deploy.onnx_policy import to_onnx
-from rmp_mjx.deploy.programs import Program, control_programs, serialised
+from rmp_mjx.deploy.programs import control_programs, serialised
 from rmp_mjx.obstacles import Obstacles
-from rmp_mjx.robot.kinematics import arm_state, site_state
 from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.learning.networks import OBS_LIMIT, Agent
 from rmp_mjx.training.policy import arrays_of, hidden_biases
@@ -27,6 +26,7 @@ from rmp_mjx.training.runs import run_folder
 from .arms import JACO
 from .base import ArmEnv
 from .options import CTRL_DT
+from .told import fixtures_program, observe_program
 
 
 def controller_of(env: ArmEnv, period: float) -> ImpedanceController:
@@ -41,29 +41,15 @@ def controller_of(env: ArmEnv, period: float) -> ImpedanceController:
             f"'{type(controller).__name__}' cannot be exported: it is no "
             "ImpedanceController"
         )
-    if controller.guard is not None:
-        raise ConfigError(
-            "a guard is made for the period of the simulation: export without guard"
-        )
-    return controller.replace(period=period)
-
-
-def observe_program(env: ArmEnv, slots: Mapping[str, Any]) -> Program | None:
-    """The observation from what an arm measures; None where it takes more."""
-    told = env.told
-    if told is None:
-        return None
-
-    def observe(q, qd, told, obstacles):
-        site = site_state(env.robot, arm_state(env.robot, q, qd))
-        spheres = Obstacles.empty().spheres
-        spheres = spheres.replace(**obstacles.get("spheres", {}))
-        physics: Any = None  # not needed, by what `told` says
-        values = env.observe(physics, site, told)
-        return env.assemble(site, q, values, lambda: spheres)
-
-    zero = jnp.zeros(env.robot.n)
-    return observe, (zero, zero, told, slots)
+    guard = controller.guard
+    if guard is not None:
+        if controller.robot.tau_rate_max is not None:
+            raise ConfigError(
+                "a guard's stop may change the torque at once, and "
+                f"'{controller.robot.name}' limits its rate: export without guard"
+            )
+        guard = guard.replace(step=period)
+    return controller.replace(period=period, guard=guard)
 
 
 def plain(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -111,8 +97,9 @@ def export(
 
     programs["policy"] = policy, (jnp.zeros(env.observation_size),)
     observe = observe_program(env, programs["control"][1][3])
-    if observe is not None:
-        programs["observe"] = observe
+    fixtures = fixtures_program(env)
+    extra = {"observe": observe, "fixtures": fixtures}
+    programs |= {name: program for name, program in extra.items() if program}
     arrays = plain(arrays_of(agent))
     metadata = {
         "task": env.name,

@@ -92,15 +92,6 @@ class Task(abc.ABC, Generic[OptionsT]):
         """The task's name."""
         return self.options.env
 
-    @property
-    def told(self) -> dict[str, Array] | None:
-        """An example of the task's state, if a robot that is told it needs no more.
-
-        `observe` then takes it, without physics. None: the observation has objects,
-        which an arm does not measure.
-        """
-        return None
-
     @classmethod
     def places(cls) -> Sequence[Place]:
         """Where an arm's grip must be able to get from the start; arms stand for it."""

@@ -76,14 +76,6 @@ class Trajectory(ArmEnv[TrajectoryOptions]):
             Entry("reached", n, "-", "1 for each of them that is reached"),
         )
 
-    @property
-    def told(self) -> dict[str, Array]:
-        """Via points, and how many are reached."""
-        return {
-            "points": jnp.zeros((self.n_points, 3)),
-            "reached": jnp.zeros((), jnp.int32),
-        }
-
     def begin(
         self, rng: Array, q: Float[Array, " n"]
     ) -> tuple[Array, dict[str, Array]]:

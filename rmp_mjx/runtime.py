@@ -53,6 +53,7 @@ def configure(
     split_cpu: bool = False,
     compile_cache: bool = True,
     cache_dir: str | os.PathLike[str] | None = None,
+    async_dispatch: bool = True,
 ) -> Runtime:
     """Prepare this process; call it before the first JAX operation.
 
@@ -69,6 +70,9 @@ def configure(
         cache_dir: Folder of that cache. By default
             ``JAX_COMPILATION_CACHE_DIR``, then ``$XDG_CACHE_HOME/rmp_mjx/xla``,
             then ``~/.cache/rmp_mjx/xla``.
+        async_dispatch: Whether XLA may compute in another thread while Python goes on.
+            A robot's loop waits for every result: without it, it saves a change of
+            threads, which takes long on a busy machine.
 
     Returns:
         The settings in force.
@@ -92,6 +96,8 @@ def configure(
             os.environ["XLA_FLAGS"] = flags = wanted
     if split_cpu:
         _split_cpu(flags)
+    if not async_dispatch:
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
     folder = _enable_compile_cache(cache_dir) if compile_cache else None
     return Runtime(flags, folder)
 

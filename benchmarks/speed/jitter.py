@@ -3,12 +3,13 @@
     python -m benchmarks.jitter --seconds 60 --json FILE
 
 The machine may be shared: what counts is the loop beside the bare one in the same run.
-Both run for a second in turn.
+Both run for some seconds in turn, at the same priority.
 """
 
 import dataclasses
 import gc
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -36,6 +37,8 @@ class Options:
     """For so long each of the two [s]."""
     folder: Path = Path("build/deploy-demo")
     """Where the exported file goes."""
+    realtime: bool = True
+    """Ask for real-time priority, and compute in the loop's own thread."""
     json: Path | None = None
     """Write the rows here, too."""
 
@@ -74,7 +77,7 @@ def _milliseconds(times: np.ndarray) -> list[float]:
 def main() -> None:
     """Measure, print, write."""
     options = tyro.cli(Options)
-    runtime.configure()
+    runtime.configure(async_dispatch=not options.realtime)
     options.folder.mkdir(parents=True, exist_ok=True)
     file = options.folder / "jitter.rmp"
     file.unlink(missing_ok=True)
@@ -90,16 +93,18 @@ def main() -> None:
     backend = deploy.CallbackBackend(simulated.read, simulated.write)
     watchdog = deploy.Watchdog(stale=None, late=10.0)
     rng = np.random.default_rng(0)
-    intervals, work, sleeps = [], [], []
+    intervals, work, sleeps, urgent = [], [], [], False
     while sum(map(len, sleeps)) * PERIOD < options.seconds:
         points = rng.uniform([0.3, -0.2, 0.05], [0.5, 0.2, 0.25], (4, 3))
         policy = deploy.PolicyTargets(deployed, deploy.ViaPoints(points))
         loop = deploy.Loop(deployed, backend, policy, watchdog=watchdog)
+        urgent = options.realtime and deploy.hurry()
         loop.run(4.0)
         ticks = loop.log.columns()
         intervals.append(ticks["interval"][1:])
         work.append(ticks["work"])
         sleeps.append(bare(len(ticks["work"]) * PERIOD))
+        deploy.relax()
     rows = [
         row("loop", np.concatenate(intervals), np.concatenate(work)),
         row("bare sleep", np.concatenate(sleeps)),
@@ -108,8 +113,9 @@ def main() -> None:
         print(each)
     if options.json:
         about = {
-            "command": f"python -m benchmarks.jitter --seconds {options.seconds:g}",
+            "command": f"python -m benchmarks.jitter {' '.join(sys.argv[1:])}",
             "machine": machine(),
+            "realtime": urgent,
             "rows": rows,
         }
         options.json.write_text(json.dumps(about, indent=1) + "\n")

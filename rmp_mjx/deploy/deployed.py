@@ -156,8 +156,7 @@ class Deployed:
             obstacles: Obstacles, batched.
 
         Raises:
-            ValueError: The task's observation is not made of these alone: the caller
-                gives it.
+            ValueError: The task's observation is not made of these alone.
         """
         self.check_observes()
         return self._jitted["observe"](*_floats(q, qd), told, obstacles)
@@ -170,9 +169,9 @@ class Deployed:
         """
         if "observe" not in self.programs:
             raise ValueError(
-                f"the observation of task '{self.metadata['task']}' has positions of "
-                "objects, which an arm does not measure: make it yourself, entry by "
-                "entry as metadata['observation'] lists them"
+                f"the observation of task '{self.metadata['task']}' takes more than "
+                "joints and what can be told: make it yourself, entry by entry as "
+                "metadata['observation'] lists them"
             )
 
     def setpoint(self, q: Any, action: Any, time: Any) -> dict[str, Any]:
@@ -211,32 +210,23 @@ class Deployed:
         return self._flat[name].twin()
 
     def flat_plan(self) -> Flat:
-        """From (q, qd, told, obstacles, time) to action and set-point, as `flat`.
+        """From (q, qd, told, obstacles, time) to the set-point, as `flat`.
 
-        Without `observe` it is (q, observation, time).
+        Raises:
+            ValueError: The file has no `observe`.
         """
+        self.check_observes()
         if "plan" not in self._flat:
-            self._flat["plan"] = self._compiled_plan()
+            observe, policy, setpoint = (
+                self._single(name) for name in ("observe", "policy", "setpoint")
+            )
+
+            def plan(q, qd, told, obstacles, time):
+                return setpoint(q, policy(observe(q, qd, told, obstacles)), time)
+
+            *_, time = self.examples("setpoint")
+            self._flat["plan"] = Flat(plan, (*self.examples("observe"), time))
         return self._flat["plan"].twin()
-
-    def _compiled_plan(self) -> Flat:
-        policy, setpoint = self._single("policy"), self._single("setpoint")
-        q, _, time = self.examples("setpoint")
-        if "observe" not in self.programs:
-            observation = self.examples("policy")[0]
-
-            def act(q, observation, time):
-                action = policy(observation)
-                return {"action": action, "setpoint": setpoint(q, action, time)}
-
-            return Flat(act, (q, observation, time))
-        observe = self._single("observe")
-
-        def plan(q, qd, told, obstacles, time):
-            action = policy(observe(q, qd, told, obstacles))
-            return {"action": action, "setpoint": setpoint(q, action, time)}
-
-        return Flat(plan, (*self.examples("observe"), time))
 
     def _single(self, name: str) -> Callable[..., Any]:
         """A program for one state."""

@@ -9,6 +9,7 @@ late 20 times (a *reflex*); `recover` clears that.
 from __future__ import annotations
 
 import importlib
+import time
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +23,8 @@ AXIS_ERROR = 0.01
 TORQUE, FORCE = 40.0, 60.0
 """Thresholds of the robot's own collision reflex [N m; N, N m], above what the
 controller's contacts cause and below what hurts the arm."""
+AT_ONCE = 5e-5
+"""A state that is there within this time has waited for us [s]."""
 
 
 class WrongRobotError(ValueError):
@@ -36,7 +39,13 @@ class FrankaBackend:
     carries_weight = True
     """Gravity is the robot's own affair."""
 
-    def __init__(self, deployed: Deployed, address: str, realtime: bool = True):
+    def __init__(
+        self,
+        deployed: Deployed,
+        address: str,
+        realtime: bool = True,
+        ahead: bool = False,
+    ):
         """Connect, and see that it is the robot of the file. Nothing moves.
 
         Args:
@@ -44,6 +53,9 @@ class FrankaBackend:
             address: Of the robot, for instance 172.16.0.2.
             realtime: Whether to insist on a real-time kernel; without one, the robot
                 stops now and then.
+            ahead: Whether a torque answers the state after the one that it is for. It
+                is then there at once, a millisecond late for the controller: for a
+                machine that needs most of a millisecond for it.
 
         Raises:
             ImportError: pylibfranka is not installed.
@@ -61,6 +73,7 @@ class FrankaBackend:
             address, config.kEnforce if realtime else config.kIgnore
         )
         self._control: Any = None
+        self._ahead, self._waiting = ahead, None
         _check_pose(deployed, self.robot.read_once())
 
     def recover(self) -> None:
@@ -76,6 +89,9 @@ class FrankaBackend:
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """The robot's next state; the first call starts torque control.
 
+        A state that has waited while the loop was late is let go: the answer to it
+        would be late again, and so would all that follow.
+
         Raises:
             pylibfranka.FrankaException: The robot has stopped itself.
         """
@@ -83,9 +99,15 @@ class FrankaBackend:
             self.robot.set_collision_behavior(
                 [TORQUE] * JOINTS, [TORQUE] * JOINTS, [FORCE] * 6, [FORCE] * 6
             )
+            self._waiting = None
             self._control = self.robot.start_torque_control()
         try:
+            called = time.perf_counter()
             state, _ = self._control.readOnce()
+            if time.perf_counter() - called < AT_ONCE:
+                state, _ = self._control.readOnce()
+            if self._waiting is not None:
+                self._control.writeOnce(self._waiting)
         except Exception:
             self._control = None
             raise
@@ -93,8 +115,12 @@ class FrankaBackend:
 
     def write(self, tau: np.ndarray) -> None:
         """Send torques without gravity, (7,) [N m]."""
+        torques = self._franka.Torques(tau.tolist())
+        if self._ahead:
+            self._waiting = torques
+            return
         try:
-            self._control.writeOnce(self._franka.Torques(tau.tolist()))
+            self._control.writeOnce(torques)
         except Exception:
             self._control = None
             raise

@@ -130,7 +130,8 @@ class Loop:
             hold: Hold the arm for so long before the loop ends [s].
 
         Raises:
-            ValueError: The first state is not one to start from.
+            ValueError: The first state is not one to start from. What the targets raise
+                at the start is raised, too.
         """
         collecting = gc.isenabled()
         gc.collect()
@@ -186,8 +187,7 @@ class Loop:
             last = now
             if done:
                 return
-            passed = pilot.ticks * period
-            if self._stop.is_set() or passed >= seconds or until():
+            if self._stop.is_set() or pilot.time + period >= seconds or until():
                 pilot.stop()
 
     def _lost(self, error: Exception) -> None:

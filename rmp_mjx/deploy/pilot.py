@@ -54,9 +54,8 @@ class Pilot:
         self.obstacles, self.targets = obstacles, targets
         self.watchdog = watchdog or Watchdog()
         self._control = deployed.flat("control")
-        self._every = round(deployed.policy_period / deployed.period)
         self.phase, self.reason = "start", None
-        self.ticks, self._since = 0, 0.0
+        self.ticks, self.time, self._since, self._due = 0, 0.0, 0.0, 0.0
         self.tau = np.zeros(deployed.n)
         self.gravity = np.zeros(deployed.n)
         self.out: dict[str, Any] = {}
@@ -93,6 +92,7 @@ class Pilot:
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         first = self.ticks == 0
+        self.time += 0.0 if first else dt
         before = q if first else self._q
         blind = self.watchdog.unreadable(self.limits, q, qd, before, dt)
         wrong = blind or self.watchdog.of_state(self.limits, q, qd)
@@ -161,10 +161,10 @@ class Pilot:
         """Take in new obstacles, and at a policy step a new set-point."""
         self._see(seen)
         moving = self.phase in ("start", "run", "stop")
-        if moving and self.ticks % self._every == 0:
-            time = self.ticks * self.deployed.period
+        if moving and self.time > self._due - 0.5 * self.deployed.period:
+            self._due = self.time + self.deployed.policy_period
             try:
-                self._control.put(2, self.targets(q, qd, time, seen))
+                self._control.put(2, self.targets(q, qd, self.time, seen))
             except Exception as error:  # whoever gives the targets, the arm must stop
                 self.fault(f"no set-point: {error!r}")
 

@@ -27,6 +27,19 @@ class Targets(Protocol):
         ...
 
 
+class Task(Protocol):
+    """What a policy is told of its task: `ViaPoints`, `Objects`, or your own."""
+
+    def told(self, p: np.ndarray, time: float) -> dict[str, Any]:
+        """The arrays that the file's `observe` takes, by name.
+
+        Args:
+            p: Position of the grip, (3,) [m].
+            time: Since the start of the loop [s].
+        """
+        ...
+
+
 class ViaPoints:
     """The task of trajectory following: which points there are, which are reached."""
 
@@ -62,7 +75,7 @@ class ViaPoints:
 class PolicyTargets:
     """The policy of an exported file that has an `observe`."""
 
-    def __init__(self, deployed: Deployed, task: ViaPoints):
+    def __init__(self, deployed: Deployed, task: Task):
         """Compile it.
 
         Args:
@@ -72,7 +85,6 @@ class PolicyTargets:
         Raises:
             ValueError: The file has no `observe`.
         """
-        deployed.check_observes()
         self.task = task
         self._grip, self._plan = deployed.flat("grip"), deployed.flat_plan()
 
@@ -85,7 +97,7 @@ class PolicyTargets:
         told = self.task.told(self._grip()["p"], time)
         for place, value in enumerate((q, qd, told, seen.slots, np.float32(time))):
             self._plan.put(place, value)
-        return self._plan()["setpoint"]
+        return self._plan()
 
 
 class ReachTargets:

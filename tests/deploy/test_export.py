@@ -12,10 +12,14 @@ import numpy as np
 import onnxruntime
 import pytest
 
+import envs
+from envs.deployment import controller_of
 from rmp_mjx import deploy
 from rmp_mjx.deploy.artefact import METADATA, VERSION, write
 from rmp_mjx.deploy.artefact import read as read_parts
+from rmp_mjx.deploy.programs import control_programs, serialise
 from rmp_mjx.obstacles import Obstacles
+from rmp_mjx.training.config import ConfigError
 
 STATES = 10_000
 
@@ -215,3 +219,47 @@ def test_a_part_that_is_not_what_the_metadata_says_is_refused(tmp_path, exported
 def test_the_same_policy_makes_the_same_bytes(tmp_path, exported, parts):
     write(tmp_path / "x.rmp", *parts)
     assert (tmp_path / "x.rmp").read_bytes() == exported.read_bytes()
+
+
+def test_a_guard_goes_along_at_the_period_of_the_loop():
+    """Same operations in float32, as above; near a sphere the guard is at work."""
+    env = envs.load("trajectory", physics="mujoco", guard=True)
+    ctrl, slots = controller_of(env, 0.001), Obstacles.empty(spheres=1)
+    assert ctrl.guard is not None and ctrl.guard.step == ctrl.period == 0.001
+    program = control_programs(ctrl, None, slots)["control"]
+    exported = jax.export.deserialize(bytearray(serialise(program)))
+    rng, number = np.random.default_rng(0), 50
+    q = env.robot.q_home + rng.normal(0.0, 0.3, (number, 7)).astype(np.float32)
+    qd = rng.normal(0.0, 0.3, (number, 7)).astype(np.float32)
+    away = rng.normal(0.0, 0.1, (number, 3)).astype(np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def own(q, qd, away):
+        target = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
+        center = target.p_des + away
+        world = slots.with_spheres(center[None], jnp.array([0.05]))
+        out = ctrl(q, qd, target, world, None, jnp.zeros(7))
+        return out.tau, out.diagnostics["guard_used"], target, center
+
+    wanted, used, target, center = own(q, qd, away)
+    arguments = jax.tree.map(
+        lambda x: np.zeros((number, *x.shape), x.dtype), program[1]
+    )
+    spheres = arguments[3]["spheres"]
+    spheres["center"][:, 0], spheres["radius"][:], spheres["active"][:] = (
+        center,
+        0.05,
+        1,
+    )
+    fields = {name: vars(target)[name] for name in arguments[2]}
+    found = exported.call(q, qd, fields, *arguments[3:])["tau"]
+    limit = np.asarray(env.robot.tau_max)
+    np.testing.assert_allclose(found / limit, wanted / limit, atol=1e-4)
+    assert 0.1 < np.mean(np.asarray(used) > 0.0) < 1.0
+
+
+def test_a_guard_is_refused_where_its_stop_may_come_too_slowly():
+    env = envs.load("trajectory", robot="fr3", physics="mujoco", guard=True)
+    with pytest.raises(ConfigError, match="'fr3' limits its rate: export without"):
+        controller_of(env, 0.001)
