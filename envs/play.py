@@ -26,6 +26,10 @@ BY_HAND = 3
 """Spheres that users can drop into a task, besides its own."""
 
 
+EVENTS = ("success", "collision", "self_collision", "joint_limit")
+"""What is counted."""
+
+
 class Moment(NamedTuple):
     """An episode after one of its steps."""
 
@@ -39,6 +43,15 @@ class Moment(NamedTuple):
     """Policy steps with each kind of event so far."""
     steps: int
     """Policy steps of all episodes so far."""
+
+    def then(self, state: State) -> Moment:
+        """The same episode one policy step later."""
+        events = dict(self.events)
+        for name in EVENTS:
+            if float(state.metrics.get(name, 0.0)):
+                events[name] = events.get(name, 0) + 1
+        reward = self.reward + float(state.reward)
+        return Moment(state, self.episode, reward, events, self.steps + 1)
 
 
 class Play:
@@ -117,14 +130,8 @@ class Play:
         over = int(before.info["step"]) >= self.env.episode_length
         if over or float(before.done):
             self.begin()
-        steps = self.now.steps + 1
-        state = self._step(self.now.state, jax.random.fold_in(self._key, steps))
-        events = dict(self.now.events)
-        for name in ("success", "collision", "self_collision", "joint_limit"):
-            if float(state.metrics.get(name, 0.0)):
-                events[name] = events.get(name, 0) + 1
-        reward = self.now.reward + float(state.reward)
-        self.now = Moment(state, self.now.episode, reward, events, steps)
+        key = jax.random.fold_in(self._key, self.now.steps + 1)
+        self.now = self.now.then(self._step(self.now.state, key))
         self.history.append(self.now)
         return self.now
 

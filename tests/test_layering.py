@@ -68,8 +68,8 @@ KNOW_MUJOCO = {"robot", "sim", "check_robot", "viewer"}
 COMMAND_LINE = {
     f"envs.{name}"
     for name in [
-        *("cli", "deployment", "eval", "export", "flags", "grid", "play", "replay"),
-        *("results", "train", "view"),
+        *("cli", "deployment", "episode_page", "eval", "export", "flags", "grid"),
+        *("play", "replay", "results", "train", "view", "worst"),
     ]
 }
 

@@ -27,13 +27,12 @@ def main(args: Sequence[str] | None = None) -> int:
 
     try:
         options, rest = _parser().parse_known_args(arguments(args))
-        if options.run is not None:
-            from rmp_mjx_envs import view
-
-            flags = ["--run", options.run, *rest]
+        if options.run is not None or options.episode is not None:
             with contextlib.suppress(KeyboardInterrupt):
-                return view.main(flags, options.port, options.out, options.seconds)
+                return _task(options, rest)
             return 0
+        if options.worst:
+            raise ValueError("--worst needs --run RUN")
         if rest:
             raise ValueError(f"unknown: {' '.join(rest)}. See --help")
         runtime.configure()
@@ -54,6 +53,24 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _task(options: argparse.Namespace, rest: list[str]) -> int:
+    """Show a policy or kept episodes in a task; returns the exit code.
+
+    Raises:
+        ValueError: The options contradict each other, or there is no such episode.
+    """
+    from rmp_mjx_envs import episode_page, view
+
+    where = options.port, options.out, options.seconds
+    if options.run is not None and not options.worst:
+        return view.main(["--run", options.run, *rest], *where)
+    if rest or (options.run is not None and options.episode is not None):
+        raise ValueError("give --episode FILE, or --run RUN --worst, and no other flag")
+    if options.episode is not None:
+        return episode_page.main([options.episode], *where)
+    return episode_page.main(episode_page.of_run(options.run), *where)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m rmp_mjx.viewer",
@@ -66,6 +83,8 @@ def _parser() -> argparse.ArgumentParser:
         help="run, policy file or pretrained/NAME: play it in its task. "
         "Flags of eval.py may follow: --deterministic --obstacles 2",
     )
+    add("--worst", action="store_true", help="of a run: its worst episodes instead")
+    add("--episode", type=Path, help="an episode that eval.py kept in RUN/worst")
     add("--robot", default="jaco2", help="name of an arm, or path of its model")
     add(
         "--controller",

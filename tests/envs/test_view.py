@@ -50,7 +50,7 @@ def test_a_sphere_dropped_onto_the_hand_is_a_collision(play):
 
 
 def test_the_page_draws_the_task_and_takes_orders(play, tmp_path):
-    page = view.TaskPage(play, "a task", 8730, tmp_path)
+    page = view.PolicyPage(play, "a task", 8730, tmp_path)
     try:
         for _ in range(playing.BY_HAND):
             page.drop()

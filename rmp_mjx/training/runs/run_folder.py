@@ -49,6 +49,8 @@ INSTANCE = "instance.png"
 STORYBOARD = "storyboard.png"
 VIDEO = "video.mp4"
 PAGE = "report.html"
+WORST = "worst"
+WORST_INDEX = f"{WORST}/index.json"
 LOCK = "lock"
 PACKAGES = (
     "jax",
@@ -81,6 +83,7 @@ RESULTS = (
     STORYBOARD,
     VIDEO,
     PAGE,
+    WORST,
 )
 
 
