@@ -69,7 +69,7 @@ COMMAND_LINE = {
     f"envs.{name}"
     for name in [
         *("cli", "deployment", "episode_page", "eval", "export", "flags", "grid"),
-        *("play", "replay", "results", "train", "view", "worst"),
+        *("play", "replay", "results", "train", "view", "watch", "worst"),
     ]
 }
 

@@ -31,8 +31,8 @@ def main(args: Sequence[str] | None = None) -> int:
             with contextlib.suppress(KeyboardInterrupt):
                 return _task(options, rest)
             return 0
-        if options.worst:
-            raise ValueError("--worst needs --run RUN")
+        if options.worst or options.watch:
+            raise ValueError("--worst and --watch need --run RUN")
         if rest:
             raise ValueError(f"unknown: {' '.join(rest)}. See --help")
         runtime.configure()
@@ -59,9 +59,11 @@ def _task(options: argparse.Namespace, rest: list[str]) -> int:
     Raises:
         ValueError: The options contradict each other, or there is no such episode.
     """
-    from rmp_mjx_envs import episode_page, view
+    from rmp_mjx_envs import episode_page, view, watch
 
     where = options.port, options.out, options.seconds
+    if options.watch and options.run is not None:
+        return watch.main(["--run", options.run, *rest], *where, options.leash)
     if options.run is not None and not options.worst:
         return view.main(["--run", options.run, *rest], *where)
     if rest or (options.run is not None and options.episode is not None):
@@ -84,6 +86,8 @@ def _parser() -> argparse.ArgumentParser:
         "Flags of eval.py may follow: --deterministic --obstacles 2",
     )
     add("--worst", action="store_true", help="of a run: its worst episodes instead")
+    add("--watch", action="store_true", help="a run: follow its training")
+    add("--leash", action="store_true", help=argparse.SUPPRESS)
     add("--episode", type=Path, help="an episode that eval.py kept in RUN/worst")
     add("--robot", default="jaco2", help="name of an arm, or path of its model")
     add(

@@ -57,6 +57,7 @@ def test_the_actions_of_a_kept_episode_lead_to_the_same_event(make, evaluated):
     starts = jax.random.split(jax.random.split(jax.random.key(SEED))[0], EPISODES)
     own = np.full(8, case.episode)  # the eight lanes that other tests compile
     state = task.reset(starts[own])
+    t = -1
     for t, then in enumerate(kept.states[1:]):
         action = kept.states[t].info["action"]
         state = task.step(state, np.tile(action, (8, 1)))
