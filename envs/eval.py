@@ -15,7 +15,7 @@ from rmp_mjx.training.learning import networks
 from rmp_mjx.training.runs import identity, policies
 from rmp_mjx.training.runs.checkpoint import CheckpointError
 
-from . import cli, registry
+from . import cli, registry, worst
 
 
 def agent_of(
@@ -63,8 +63,7 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, CheckpointError) else 2
     key = jax.random.key(options.seed)
-    filmed = film.EPISODES if options.video else 0
-    own, tape = evaluate.record_episodes(env, agent, options.episodes, key, filmed)
+    own, tape = worst.recorder(env, options.episodes, options.video)(agent, key)
     results = {env.engine: own} | {
         other.engine: evaluate.run_episodes(other, agent, options.episodes, key)
         for other in others
@@ -79,12 +78,14 @@ def main(args: Sequence[str] | None = None) -> int:
     }
     title = f"{options.agent} agent, {options.task.title}, {options.task.spheres}"
     columns = report.save(results, env.metrics, about, options.folder, title)
+    worst.save(env, tape, own, options.folder)
     title += f", {options.episodes} episodes"
     console.print(report.table(columns, title, env.metrics))
     if options.video:
         from .render import render  # loads graphics libraries
 
-        film.publish(partial(render, env), tape, env.dt, options.folder, console)
+        shown = tape.first(film.EPISODES)
+        film.publish(partial(render, env), shown, env.dt, options.folder, console)
     console.print(f"results: {options.folder}", markup=False, highlight=False)
     return 0
 

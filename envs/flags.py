@@ -64,6 +64,9 @@ class TrainOptions(TrainConfig[Task]):
     `controllers`, one after the other."""
     controllers: str | None = None
     """Controllers of a grid, joined by commas."""
+    watch: bool = False
+    """Show a live view of one environment and the curves in the browser, with what the
+    training leaves of the processor (needs the extra `viewer`)."""
     processes: Processes = Processes()
     """Several processes that train one run together."""
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from rich.console import Console
 
 from rmp_mjx import runtime
@@ -19,11 +20,16 @@ from rmp_mjx.viewer.player import kept
 from . import cli, registry
 from .base import ArmEnv
 from .eval import agent_of
+from .options import Options
 from .spheres import AWAY
 from .types import State
 
 BY_HAND = 3
 """Spheres that users can drop into a task, besides its own."""
+
+
+EVENTS = ("success", "collision", "self_collision", "joint_limit")
+"""What is counted."""
 
 
 class Moment(NamedTuple):
@@ -39,6 +45,15 @@ class Moment(NamedTuple):
     """Policy steps with each kind of event so far."""
     steps: int
     """Policy steps of all episodes so far."""
+
+    def then(self, state: State) -> Moment:
+        """The same episode one policy step later."""
+        events = dict(self.events)
+        for name in EVENTS:
+            if float(state.metrics.get(name, 0.0)):
+                events[name] = events.get(name, 0) + 1
+        reward = self.reward + float(state.reward)
+        return Moment(state, self.episode, reward, events, self.steps + 1)
 
 
 class Play:
@@ -58,10 +73,20 @@ class Play:
         self.env, self.by_hand = env, by_hand
         self._key = jax.random.key(seed)
         self._reset = jax.jit(env.reset)
-        self._step = jax.jit(partial(_step, env, agent))
+        self._step = jax.jit(partial(_step, env))
+        self.agent = agent
         self.history: collections.deque[Moment] = collections.deque(maxlen=kept(env.dt))
         self.now = self._started(1, 0)
         self._drop({})
+
+    @property
+    def agent(self) -> Callable[[Any, Any], Any]:
+        """Who acts; another one of the same kind compiles nothing."""
+        return self._agent
+
+    @agent.setter
+    def agent(self, agent: Callable[[Any, Any], Any]) -> None:
+        self._agent = agent if isinstance(agent, Partial) else Partial(agent)
 
     @property
     def period(self) -> float:
@@ -113,7 +138,7 @@ class Play:
 
     def advance(self, state: State, key: Any) -> State:
         """Where one action of the agent leads."""
-        return self._step(state, key)
+        return self._step(self._agent, state, key)
 
     def step(self) -> Moment:
         """One policy step; an episode that has ended makes room for the next."""
@@ -121,19 +146,13 @@ class Play:
         over = int(before.info["step"]) >= self.env.episode_length
         if over or float(before.done):
             self.begin()
-        steps = self.now.steps + 1
-        state = self.advance(self.now.state, jax.random.fold_in(self._key, steps))
-        events = dict(self.now.events)
-        for name in ("success", "collision", "self_collision", "joint_limit"):
-            if float(state.metrics.get(name, 0.0)):
-                events[name] = events.get(name, 0) + 1
-        reward = self.now.reward + float(state.reward)
-        self.now = Moment(state, self.now.episode, reward, events, steps)
+        key = jax.random.fold_in(self._key, self.now.steps + 1)
+        self.now = self.now.then(self.advance(self.now.state, key))
         self.history.append(self.now)
         return self.now
 
 
-def _step(env: ArmEnv, agent: Any, state: State, key: Any) -> State:
+def _step(env: ArmEnv, agent: Partial, state: State, key: Any) -> State:
     return env.step(state, agent(state.obs[None], key)[0])
 
 
@@ -145,8 +164,16 @@ def load(args: Sequence[str]) -> tuple[Play, str]:
     """
     options, config = cli.parse_eval(args)
     runtime.configure()
-    slots = options.task.obstacles + BY_HAND
-    task = dataclasses.replace(options.task, obstacles=slots, physics="mujoco")
-    env = registry.make(task)
-    _, agent = agent_of(dataclasses.replace(options, task=task), config, env, Console())
-    return Play(env, agent, options.seed, BY_HAND), f"{options.agent}: {task.title}"
+    env = task_with_room(options.task)
+    roomy = dataclasses.replace(options, task=env.options)
+    _, agent = agent_of(roomy, config, env, Console())
+    title = f"{options.agent}: {options.task.title}"
+    return Play(env, agent, options.seed, BY_HAND), title
+
+
+def task_with_room(options: Options) -> ArmEnv:
+    """The task in MuJoCo C, with room for the spheres that users drop."""
+    slots = options.obstacles + BY_HAND
+    return registry.make(
+        dataclasses.replace(options, obstacles=slots, physics="mujoco")
+    )

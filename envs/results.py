@@ -10,7 +10,7 @@ from rich.console import Console
 
 from rmp_mjx.files import write_text
 from rmp_mjx.training.config import TrainConfig
-from rmp_mjx.training.evaluation import curves, evaluate, film, report
+from rmp_mjx.training.evaluation import curves, film, report
 from rmp_mjx.training.evaluation.learning_curve import (
     Baseline,
     plot_details,
@@ -21,6 +21,7 @@ from rmp_mjx.training.learning.networks import Agent
 from rmp_mjx.training.runs import distributed, metrics, policies, run_folder
 from rmp_mjx.training.runs.loop import TrainResult
 
+from . import worst
 from .base import ArmEnv
 from .options import Options
 
@@ -100,16 +101,16 @@ def evaluate_seeds(
 ) -> None:
     """Run the evaluation's episodes with every seed's policy; report them."""
     key = jax.random.key(config.ppo.seed + 1000)
-    filmed = film.EPISODES if config.run.video else 0
-    record = evaluate.recorder(env, config.run.eval_episodes, filmed)
+    record = worst.recorder(env, config.run.eval_episodes, config.run.video)
     about = {"agent": "policy", "deterministic": config.run.eval_deterministic}
-    columns, tapes = [], []
+    columns, films = [], []
     for k, place in enumerate(run_folder.seed_folders(config, folder)):
         results, tape = record(seeds.of_seed(agent, k, config.ppo), key)
-        tapes.append(tape)
+        films.append(tape.first(film.EPISODES))
         if primary:
             found = {env.engine: results}
             columns.append(report.save(found, env.metrics, about, place, config.title))
+            worst.save(env, tape, results, place)
     if not primary:
         return
     shown = columns[0]
@@ -119,7 +120,7 @@ def evaluate_seeds(
     if config.run.video:
         from .render import render  # loads graphics libraries
 
-        film.publish(partial(render, env), tapes[0], env.dt, folder, console)
+        film.publish(partial(render, env), films[0], env.dt, folder, console)
 
 
 RESULTS = Path(__file__).parents[1] / "docs/results/store/training.parquet"

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from rmp_mjx.viewer.clock_panel import ClockPanel
-
 from .play import Moment
+from .task_page import TaskPage
 from .teleoperation import KP, Teleoperation, Wish, load
-from .view import TaskPage
 
 NUDGE = 0.02
 """Distance that the target moves with every stroke of a key [m]."""
@@ -33,19 +31,15 @@ class DrivePage(TaskPage):
 
     def __init__(self, play: Teleoperation, title: str, port: int, folder: Path):
         """Start the server; see `TaskPage`."""
+        super().__init__(play, play.env, title, port, folder)
         self.driven, self._episode = play, 0
-        super().__init__(play, title, port, folder)
-
-    def _panel(self) -> None:
-        gui, driven = self.server.gui, self.driven
-        self.status = gui.add_markdown("compiling ...")
+        gui, driven = self.server.gui, play
         self.told = gui.add_markdown("")
         low, high = driven.stiffnesses
         self.kp = gui.add_slider("Stiffness", low, high, 1.0, KP)
         record = gui.add_button("Record a demonstration")
         keep, discard = gui.add_button("Keep it"), gui.add_button("Discard it")
         again = gui.add_button("New episode")
-        self.clock = ClockPanel(self)
         self.target = self.server.scene.add_transform_controls(
             "/target", scale=0.14, depth_test=False
         )

@@ -1,9 +1,12 @@
 """Train a policy: `train.py`, and `rmp-mjx-train` where this is installed."""
 
+import contextlib
+import importlib.util
 import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -36,14 +39,20 @@ def learn(env, config: TrainConfig, folder, console: Console) -> TrainResult:
     return trainer.train(env, config, folder, console)
 
 
-def run(config: TrainConfig, console: Console) -> int:
-    """Train and evaluate one configuration; returns the exit code."""
+def run(config: TrainConfig, console: Console, watched: bool = False) -> int:
+    """Train and evaluate one configuration; returns the exit code.
+
+    Args:
+        config: Configuration.
+        console: Terminal.
+        watched: Whether to show a live view of it.
+    """
     try:
         folder, lock = distributed.open_run(config)
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    with lock:
+    with lock, view_of(folder, config, console, watched):
         runtime.configure(split_cpu=distributed.alone())
         try:
             env = registry.make(config.task)
@@ -60,12 +69,35 @@ def run(config: TrainConfig, console: Console) -> int:
         return result.exit_code
 
 
+def check_watch(grid: bool) -> None:
+    """Refuse a live view that cannot be.
+
+    Raises:
+        ConfigError: Of a grid, or without the extra.
+    """
+    if grid:
+        raise ConfigError("--watch shows one run: leave it out for a grid")
+    if importlib.util.find_spec("viser") is None:
+        raise ConfigError("--watch needs an extra: pip install 'rmp-mjx[viewer]'")
+
+
+def view_of(folder: Path, config: TrainConfig, console: Console, watched: bool) -> Any:
+    """The live view of a run, as a context; the primary process has it."""
+    if not watched or not distributed.is_primary():
+        return contextlib.nullcontext()
+    from .watch import watching  # needs an extra
+
+    return watching(folder, config, console)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Parse, check, train, evaluate; returns the exit code."""
     console = Console()
     try:
         options, wanted = cli.parse_train(args)
         configs = list(wanted.cells().values()) if wanted else [options.config]
+        if options.watch:
+            check_watch(wanted is not None)
         for config in configs:
             sim.require(config.task.physics)
             if config.ppo.demos is not None and not config.run.resume:
@@ -79,7 +111,7 @@ def main(args: Sequence[str] | None = None) -> int:
         console = Console(quiet=not distributed.is_primary())
     if wanted:
         return grid.run(wanted, partial(run, console=console), console)
-    return run(configs[0], console)
+    return run(configs[0], console, options.watch)
 
 
 if __name__ == "__main__":

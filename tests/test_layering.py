@@ -70,8 +70,9 @@ KNOW_MUJOCO = {"robot", "sim", "check_robot", "viewer"}
 COMMAND_LINE = {
     f"envs.{name}"
     for name in [
-        *("cli", "deployment", "eval", "export", "flags", "grid", "play", "replay"),
-        *("results", "teleoperate", "teleoperation", "train", "view"),
+        *("cli", "deployment", "episode_page", "eval", "export", "flags", "grid"),
+        *("play", "replay", "results", "teleoperate", "teleoperation", "train"),
+        *("view", "watch", "worst"),
     ]
 }
 

@@ -137,3 +137,23 @@ def test_what_only_names_a_run_is_escaped(runs):
     odd = [dataclasses.replace(groups[0], name="<b>$x_1$</b>"), groups[1]]
     found = page(odd)
     assert "&lt;b&gt;$x_1$&lt;/b&gt;" in found and "<b>$" not in found
+
+
+def test_the_page_lists_the_worst_episodes_of_a_run(runs):
+    place = runs[0] / run_folder.WORST
+    place.mkdir()
+    index = runs[0] / run_folder.WORST_INDEX
+    case = {"file": "00061.npz", "episode": 61, "clearance": -0.00284, "return": -63.7}
+    case["moments"] = {"clearance": 0.7, "collision": 0.65}
+    try:
+        index.write_text(json.dumps({"kept": [case]}))
+        shown = page(grouped(read_run(runs[0])))
+        for words in ("-2.8", "collision 0.65 s", "00061.npz", "--episode FILE"):
+            assert words in shown
+        index.write_text(json.dumps({"kept": [{"episode": 61}]}))
+        with pytest.raises(ValueError, match="damaged"):
+            page(grouped(read_run(runs[0])))
+    finally:
+        index.unlink()
+        place.rmdir()
+    assert "Worst episodes" not in page(grouped(read_run(runs[0])))

@@ -190,10 +190,12 @@ def training(
     env = envs.load("trajectory", controller="rmp_vices", physics=physics)
     ppo, key = make_ppo(env, config), jax.random.key(0)
 
+    nothing = evaluate.Taped(0, 0)
+
     def play(state, key):
         parameters = state.normalizer, state.learner.policy
         agent = make_agent(ppo.networks, *parameters, deterministic=True)
-        return evaluate.play(env, episodes, 0, agent, key)[0]
+        return evaluate.play(env, episodes, nothing, agent, key)[0]
 
     start = programs.add(ppo.init, key).result()[0](key)
     trainer = programs.add(ppo.iterate, start)

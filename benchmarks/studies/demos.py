@@ -1,10 +1,11 @@
 """What demonstrations save: PPO on the block with and without them, several seeds.
 
 `python -m benchmarks.demos --json benchmarks/results/demos.json`. The scripted expert
-of `benchmarks.experts` demonstrates; `--file` keeps what it did, for `train.py
---demos`. Every few iterations the mean action of every seed's policy plays the same
-episodes. What counts is how many policy steps a seed had gathered when it first solved
-nine of ten, at two looks in a row.
+of `benchmarks.experts` demonstrates. What is done is disturbed and what it meant is
+recorded, so that the clones see how to come back (Laskey et al., 2017, DART). `--file`
+keeps the demonstrations, for `train.py --demos`. Every few iterations the mean action
+of every seed's policy plays the same episodes. What counts is how many policy steps a
+seed had gathered when it first solved nine of ten, at two looks in a row.
 """
 
 from __future__ import annotations
@@ -37,24 +38,30 @@ WANTED = 0.9
 """Share of the episodes that a policy must solve."""
 
 
-def demonstrate(env: ArmEnv, act: experts.Act, episodes: int, seed: int = 0):
+def demonstrate(
+    env: ArmEnv, act: experts.Act, episodes: int, noise: float, seed: int = 0
+) -> Demonstrations:
     """Whole episodes of an expert.
 
     Args:
         env: The task.
         act: The expert.
         episodes: How many, all from starts of their own.
-        seed: Of the starts.
+        noise: Standard deviation of what is added to what is done, not to what is
+            recorded.
+        seed: Of starts and noise.
     """
 
     def episode(key: Any):
-        state = env.reset(key)
+        key_noise, key_start = jax.random.split(key)
+        state = env.reset(key_start)
 
-        def step(carry, _):
+        def step(carry, key):
             state, memory = carry
             memory, action = act(env, state, memory)
             action = jnp.clip(action, -1.0, 1.0)
-            new = env.step(state, action)
+            disturbed = action + noise * jax.random.normal(key, action.shape)
+            new = env.step(state, jnp.clip(disturbed, -1.0, 1.0))
             row = {
                 "observation": state.obs,
                 "action": action,
@@ -65,7 +72,9 @@ def demonstrate(env: ArmEnv, act: experts.Act, episodes: int, seed: int = 0):
             return (new, memory), row
 
         start = state, experts.start(env, state)
-        return jax.lax.scan(step, start, None, length=env.episode_length)[1]
+        return jax.lax.scan(
+            step, start, jax.random.split(key_noise, env.episode_length)
+        )[1]
 
     keys = jax.random.split(jax.random.key(seed), episodes)
     rows = jax.tree.map(np.asarray, jax.jit(jax.vmap(episode))(keys))
@@ -84,6 +93,7 @@ def curve(
     demos: Demonstrations | None,
     every: int,
     episodes: int,
+    most: int,
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Train all seeds; again and again the policy steps so far, and each one's success.
 
@@ -93,6 +103,7 @@ def curve(
         demos: What the policies start from; None: from scratch.
         every: Iterations between two looks.
         episodes: Episodes of a look, the same ones for all.
+        most: Policy steps after which it ends.
     """
     programs = seeds.programs(env, config)
     look = evaluate.recorder(env, episodes, 0)
@@ -101,20 +112,18 @@ def curve(
         state = programs.clone(state, demos.observation, demos.action)
     # One function for all agents: another would be compiled anew.
     act: Any = make_agent(programs.ppo.networks, None, None, True)
-    done = 0
-    while True:
+    for done in range(0, most // config.steps_per_iteration + 1, every):
+        for _ in range(every if done else 0):
+            state, data, _ = programs.gather(state)
+            state, _ = programs.learn(state, data)
         parts = state.normalizer, state.learner.policy
         agents = [
             Partial(act.func, *seeds.of_seed(parts, k, config))
             for k in range(config.num_seeds)
         ]
-        key = jax.random.key(1)
+        key = jax.random.key(config.seed + 1000)
         solved = [look(agent, key)[0]["success"].mean() for agent in agents]
         yield done * config.steps_per_iteration, np.array(solved)
-        for _ in range(every):
-            state, data, _ = programs.gather(state)
-            state, _ = programs.learn(state, data)
-        done += every
 
 
 def steps_to(looks: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
@@ -146,7 +155,9 @@ def rows_of(name: str, looks: Sequence[tuple[int, np.ndarray]]) -> list[Row]:
 def study(options: argparse.Namespace) -> Iterator[list[Row]]:
     """Demonstrate, then train in both ways."""
     env = envs.load("push")
-    demos = demonstrate(env, experts.push, options.demonstrations, options.seed)
+    demos = demonstrate(
+        env, experts.push, options.demonstrations, options.noise, options.seed
+    )
     if options.file:
         demonstrations.write(options.file, demos)
     note = f"{demos.episodes} episodes, {len(demos.step):,} steps"
@@ -154,14 +165,13 @@ def study(options: argparse.Namespace) -> Iterator[list[Row]]:
     yield [Row("demonstrations/success", float(np.mean(solved)), "share", note)]
     config = PPOConfig(seed=options.seed, num_seeds=options.num_seeds)
     cloned = dataclasses.replace(config, demos=str(options.file))
-    train = partial(curve, env, every=options.every, episodes=options.episodes)
+    how = {name: getattr(options, name) for name in ("every", "episodes", "most")}
+    train = partial(curve, env, **how)
     for name, ppo, used in (("demos", cloned, demos), ("scratch", config, None)):
         looks = []
         for steps, shares in train(ppo, used):
             looks.append((steps, shares))
             print(name, f"{steps:,}", np.round(shares, 2), flush=True)
-            if np.isfinite(steps_to(looks)).all() or steps >= options.most:
-                break
         yield rows_of(name, looks)
 
 
@@ -170,12 +180,13 @@ def main(args: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="benchmarks/results/demos.json")
     parser.add_argument("--file", type=Path, help="keep the demonstrations")
-    parser.add_argument("--demonstrations", type=int, default=50, help="episodes")
+    parser.add_argument("--demonstrations", type=int, default=100, help="episodes")
+    parser.add_argument("--noise", type=float, default=0.3, help="of what is done")
     parser.add_argument("--seed", type=int, default=0, help="first seed")
     parser.add_argument("--num_seeds", type=int, default=5)
     parser.add_argument("--every", type=int, default=8, help="iterations between looks")
     parser.add_argument("--episodes", type=int, default=50, help="of a look")
-    parser.add_argument("--most", type=int, default=400_000, help="policy steps")
+    parser.add_argument("--most", type=int, default=330_000, help="policy steps")
     options = parser.parse_args(args)
     runtime.configure()
     rows: list[Row] = []

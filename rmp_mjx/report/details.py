@@ -1,10 +1,11 @@
-"""What one run says about itself: pictures it left, its options, its software."""
+"""What one run says about itself: pictures, worst episodes, options, software."""
 
 import base64
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from rmp_mjx.files import read_json
 from rmp_mjx.report.runs import Run, text
 from rmp_mjx.training.runs import run_folder
 
@@ -46,3 +47,25 @@ def software(run: Run) -> Sequence[Sequence[str]]:
     """Heading and a line for each version at a run's last start."""
     found = run_folder.last_start(run.folder)
     return [["software", "version"], *([k, text(v)] for k, v in found.items())]
+
+
+def worst(run: Run) -> list[list[str]]:
+    """Heading and a line for each bad episode of a run's evaluation; empty without any.
+
+    Raises:
+        ValueError: Their list is damaged.
+    """
+    place = run_folder.seed_folder(run.config, run.folder, run.seed)
+    path = place / run_folder.WORST_INDEX
+    if not path.is_file():
+        return []
+    lines = [["episode", "least clearance [mm]", "return", "what happened", "file"]]
+    try:
+        for case in read_json(path)["kept"]:
+            happened = ", ".join(f"{n} {t:.2f} s" for n, t in case["moments"].items())
+            numbers = f"{1e3 * case['clearance']:.1f}", f"{case['return']:.1f}"
+            file = str(path.parent / case["file"])
+            lines.append([str(case["episode"]), *numbers, happened, file])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
+    return lines

@@ -131,11 +131,18 @@ def _origin(run: Run) -> list[str]:
 
 
 def _details(run: Run) -> str:
-    """The pictures, options and software of a run; the tables are folded away."""
+    """Pictures and worst episodes of a run; options and software are folded away."""
     name = html.escape(f"{run.folder}, seed {run.seed}")
     parts = [f"<h2>{name}</h2>"]
     for words, code in details.pictures(run):
         parts.append(f'<img alt="{words}" src="data:image/png;base64,{code}">')
+    worst = details.worst(run)
+    if worst:
+        parts.append(
+            "<h3>Worst episodes of the evaluation</h3>"
+            f"{_html_table(worst)}<p><code>python -m rmp_mjx.viewer --episode FILE"
+            "</code> opens one at the moment it happened.</p>"
+        )
     for title, lines in (
         ("Options", details.options(run)),
         ("Software", details.software(run)),

@@ -27,12 +27,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
     try:
         options, rest = _parser().parse_known_args(arguments(args))
-        if options.run is not None:
-            from rmp_mjx_envs import view
-
-            flags = ["--run", options.run, *rest]
+        if options.run is not None or options.episode is not None:
             with contextlib.suppress(KeyboardInterrupt):
-                return view.main(flags, options.port, options.out, options.seconds)
+                return _task(options, rest)
             return 0
         if options.teleoperate is not None:
             from rmp_mjx_envs import teleoperate
@@ -41,6 +38,8 @@ def main(args: Sequence[str] | None = None) -> int:
             with contextlib.suppress(KeyboardInterrupt):
                 return teleoperate.main(options.teleoperate, rest, *place)
             return 0
+        if options.worst or options.watch:
+            raise ValueError("--worst and --watch need --run RUN")
         if rest:
             raise ValueError(f"unknown: {' '.join(rest)}. See --help")
         runtime.configure()
@@ -61,6 +60,26 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _task(options: argparse.Namespace, rest: list[str]) -> int:
+    """Show a policy or kept episodes in a task; returns the exit code.
+
+    Raises:
+        ValueError: The options contradict each other, or there is no such episode.
+    """
+    from rmp_mjx_envs import episode_page, view, watch
+
+    where = options.port, options.out, options.seconds
+    if options.watch and options.run is not None:
+        return watch.main(["--run", options.run, *rest], *where, options.leash)
+    if options.run is not None and not options.worst:
+        return view.main(["--run", options.run, *rest], *where)
+    if rest or (options.run is not None and options.episode is not None):
+        raise ValueError("give --episode FILE, or --run RUN --worst, and no other flag")
+    if options.episode is not None:
+        return episode_page.main([options.episode], *where)
+    return episode_page.main(episode_page.of_run(options.run), *where)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m rmp_mjx.viewer",
@@ -79,6 +98,10 @@ def _parser() -> argparse.ArgumentParser:
         help="drive a task yourself, and record demonstrations for train.py --demos. "
         "Flags of the task may follow: --controller vices",
     )
+    add("--worst", action="store_true", help="of a run: its worst episodes instead")
+    add("--watch", action="store_true", help="a run: follow its training")
+    add("--leash", action="store_true", help=argparse.SUPPRESS)
+    add("--episode", type=Path, help="an episode that eval.py kept in RUN/worst")
     add("--robot", default="jaco2", help="name of an arm, or path of its model")
     add(
         "--controller",

@@ -40,17 +40,17 @@ class ClockPanel:
     def toggle(self) -> None:
         """Pause, or go on from the newest frame."""
         self.player.paused = not self.player.paused
-        self._to_now()
+        self.to_now()
 
     def step_once(self) -> None:
         """Pause, and go on by one step."""
         self.player.once()
-        self._to_now()
+        self.to_now()
 
     def go_on_from_there(self) -> None:
         """Go on from what is shown."""
         self.player.go_on_from_there()
-        self._to_now()
+        self.to_now()
 
     def start_or_save(self) -> None:
         """Start a recording, or end it as a file."""
@@ -61,16 +61,17 @@ class ClockPanel:
             recording.start()
             self.saved.content = ""
 
+    def to_now(self) -> None:
+        """Put the slider back."""
+        if self.back.value:
+            self.back.value = 0.0
+
     def _turn(self) -> None:
         top, _, bottom = self.speed.value.partition("/")
         self.player.speed = float(top) / float(bottom or 1)
 
     def _look_back(self) -> None:
         self.player.look_back(float(self.back.value))
-
-    def _to_now(self) -> None:
-        if self.back.value:
-            self.back.value = 0.0
 
 
 def _name(button: Any, label: str) -> None:

@@ -1,21 +1,18 @@
-"""The panel for who drives, how stiffly, what pushes, and time."""
+"""The panel for who drives, how stiffly, what pulls, and time."""
 
 from __future__ import annotations
-
-import numpy as np
 
 from rmp_mjx.viewer.clock_panel import ClockPanel
 from rmp_mjx.viewer.dials import CONTROLLERS
 from rmp_mjx.viewer.session import KP
+from rmp_mjx.viewer.spring import Spring
 from rmp_mjx.viewer.stage import Stage
 
 NOBODY = "nobody"
-STRONGEST = 60.0
-"""Its greatest force [N]."""
 
 
 class DrivePanel:
-    """Controllers, time, stiffness, push."""
+    """Controllers, time, stiffness, the spring."""
 
     def __init__(self, page: Stage):
         """Make the controls in the tab that is open."""
@@ -34,9 +31,10 @@ class DrivePanel:
         self.kp_pos = gui.add_slider("Stiffness", 10.0, 600.0, 5.0, KP)
         self.kp_ori = gui.add_slider("Turning stiffness", 10.0, 600.0, 5.0, KP)
         bodies = [NOBODY, *page.session.robot.body_names]
-        self.pushed = gui.add_dropdown("Push the link", bodies, initial_value=NOBODY)
-        self.force = gui.add_slider("Push along", 0.0, STRONGEST, 1.0, 20.0)
-        self.toward = gui.add_dropdown("Direction", ["x", "y", "z", "-x", "-y", "-z"])
+        bodies = [NOBODY, *page.session.robot.body_names]
+        self.spring = Spring(page)
+        self.pushed = gui.add_dropdown("Pull the link", bodies, initial_value=NOBODY)
+        self.release = gui.add_button("Let go")
         self._wire()
 
     def say(self, words: str) -> None:
@@ -47,8 +45,8 @@ class DrivePanel:
         page = self.page
         for control in (self.driver, self.rival):
             control.on_update(lambda _: page.order(self._drive))
-        for control in (self.pushed, self.force, self.toward):
-            control.on_update(lambda _: page.order(self._push))
+        self.pushed.on_update(lambda _: page.order(self._pull))
+        self.release.on_click(lambda _: page.order(self.let_go))
         for name, control in {"kp_pos": self.kp_pos, "kp_ori": self.kp_ori}.items():
 
             @control.on_update
@@ -63,16 +61,18 @@ class DrivePanel:
             names.append(self.rival.value)
         self.page.session.drive(names)
 
-    def _push(self) -> None:
-        if self.pushed.value == NOBODY:
-            self.page.session.push = None
-            return
-        axis = np.eye(3)["xyz".index(self.toward.value[-1])]
-        sign = -1.0 if self.toward.value.startswith("-") else 1.0
-        self.page.session.push = self.pushed.value, sign * self.force.value * axis
+    def _pull(self) -> None:
+        chosen = self.pushed.value
+        self.spring.choose("" if chosen == NOBODY else chosen)
+
+    def let_go(self) -> None:
+        """Pull no link any more."""
+        self.spring.release()
+        self.pushed.value = NOBODY
 
     def _home(self) -> None:
         self.page.session.start()
+        self.let_go()
         self.page.player.shown = None
         if self.page.player.paused:
             self.clock.toggle()

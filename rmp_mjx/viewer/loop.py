@@ -28,6 +28,9 @@ class Loop(abc.ABC, Generic[FrameT]):
     between two ticks.
     """
 
+    frames = FRAMES
+    """Pictures per second of this page."""
+
     def __init__(
         self, simulation: Simulation[FrameT], title: str, port: int, folder: Path
     ):
@@ -72,7 +75,7 @@ class Loop(abc.ABC, Generic[FrameT]):
             elapsed: Wall time since the last call [s].
         """
         self.draw(self.player.advance(elapsed))
-        self.recording.tick(1.0 / FRAMES)
+        self.recording.tick(1.0 / self.frames)
 
     def run(self, seconds: float | None = None) -> None:
         """Obey and tick until `stop`, or for so long [s]."""
@@ -86,7 +89,7 @@ class Loop(abc.ABC, Generic[FrameT]):
                 self.tick(now - last)
                 last = now
                 spent = time.perf_counter() - now
-                self._stop.wait(max(0.0, 1.0 / FRAMES - spent))
+                self._stop.wait(max(0.0, 1.0 / self.frames - spent))
         finally:
             self.server.stop()
 

@@ -51,6 +51,11 @@ class Page(Stage):
         self._shown_target = session.target
         self._build()
 
+    def tick(self, elapsed: float) -> None:
+        """Renew the spring's force, then simulate and draw."""
+        self.drive.spring.tick()
+        super().tick(elapsed)
+
     def refuse(self, error: ValueError) -> None:
         """Say why an order is not obeyed."""
         self.drive.say(f"**{error}**")

@@ -125,7 +125,8 @@ class Session:
         names = self.controllers if controllers is None else tuple(controllers)
         self._check(names)
         self.controllers = names
-        self.time, self.arms = 0.0, [self._at_home() for _ in names]
+        self.time, self.push = 0.0, None
+        self.arms = [self._at_home() for _ in names]
         self.history.clear()
         p, R = jax.jit(site_pose)(self.robot, jnp.asarray(self.robot.q_home))
         wxyz = np.zeros(4)
@@ -237,6 +238,13 @@ class Session:
                 *_single(now.tau_ext),
             )
         )
+
+    def body(self, name: str, arm: int = 0) -> np.ndarray:
+        """Where a push on a link acts: its centre of mass, (3,) [m]."""
+        data = self.arms[arm]
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        return data.body(name).xipos.copy()
 
     def restore(self, frame: Frame) -> None:
         """Go on from a frame; what came after it is forgotten."""

@@ -1,13 +1,24 @@
 """A policy at work in its task, as the viewer plays it."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
+import polars as pl
 import pytest
+from rich.console import Console
 
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 
 from envs import play as playing
-from envs import view
+from envs import view, watch
+from envs.cli import make_config
+from envs.train import main as train
+from rmp_mjx.training.learning.networks import zero_agent
 from rmp_mjx.viewer.__main__ import main
+from tests.viewer.chromium import wait
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +61,7 @@ def test_a_sphere_dropped_onto_the_hand_is_a_collision(play):
 
 
 def test_the_page_draws_the_task_and_takes_orders(play, tmp_path):
-    page = view.TaskPage(play, "a task", 8730, tmp_path)
+    page = view.PolicyPage(play, "a task", 8730, tmp_path)
     try:
         for _ in range(playing.BY_HAND):
             page.drop()
@@ -63,6 +74,95 @@ def test_the_page_draws_the_task_and_takes_orders(play, tmp_path):
         assert play.dropped == {}
     finally:
         page.server.stop()
+
+
+@pytest.fixture
+def watched(play, tmp_path, monkeypatch):
+    """The page of a training whose folder the test fills; checkpoints are feigned."""
+    agent = zero_agent(play.env.action_size)
+    monkeypatch.setattr(
+        watch.policies, "load_agent", lambda env, config, run, *_: (7, agent)
+    )
+    run, before = tmp_path / "run", play.agent
+    run.mkdir()
+    page = watch.WatchPage(play, make_config(), run, 8740, tmp_path)
+    yield page
+    page.server.stop()
+    play.agent = before
+
+
+def test_a_training_is_followed_by_its_curves_and_its_newest_policy(watched, play):
+    watched.look()
+    assert not watched.charts and watched.iterations == 0
+    rows = {"steps": [10, 20, 30], "episode/return": [None, 1.0, 2.0], "seed": [0] * 3}
+    file = watched.run_folder / "metrics.parquet"
+    pl.DataFrame(rows).write_parquet(file)
+    (watched.run_folder / "checkpoints" / "7").mkdir(parents=True)
+    (watched.run_folder / "checkpoints" / "8.tmp").mkdir()
+    watched.look()
+    assert set(watched.charts) == {"episode/return"}
+    watched._loading.join(60.0)
+    watched._obey()
+    assert watched.iterations == 7 and "iteration 7" in watched.policy.content
+    assert np.array_equal(watched.charts["episode/return"].data[0], [10, 20, 30])
+    more = {name: [*values, values[-1]] for name, values in rows.items()}
+    pl.DataFrame(more).write_parquet(file)
+    os.utime(file, (2e9, 2e9))  # newer, whatever the clock's resolution
+    watched.look()
+    assert len(watched.charts["episode/return"].data[0]) == 4
+
+
+def test_a_page_that_nobody_looks_at_costs_its_training_nothing(watched, play):
+    before = play.now
+    watched.tick(1.0)
+    assert play.now is before
+    watched.watched = lambda: True
+    watched.tick(1.0)
+    assert play.now is not before
+
+
+def test_the_page_of_a_training_ends_with_it_and_does_it_no_harm(tmp_path):
+    console = Console(quiet=True)
+    with watch.watching(tmp_path, make_config(), console) as page:
+        assert page.poll() is None
+    assert page.returncode is not None
+    with watch.watching(tmp_path, make_config(), console) as page:
+        page.kill()
+
+
+def test_a_killed_training_takes_its_page_along(tmp_path, root):
+    lines = (
+        "import sys, time, pathlib, rich.console",
+        "from envs import watch, cli",
+        "run, console = pathlib.Path(sys.argv[1]), rich.console.Console(quiet=True)",
+        "with watch.watching(run, cli.make_config(), console) as page:",
+        "    print(page.pid, flush=True)",
+        "    time.sleep(300)",
+    )
+    command = [sys.executable, "-c", "\n".join(lines), str(tmp_path)]
+    training = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root)
+    assert training.stdout is not None
+    page = Path("/proc") / training.stdout.readline().strip()
+    assert page.exists()
+    training.kill()
+    training.wait()
+    # its imports, at the lowest priority, on a busy machine
+    wait(lambda: not page.exists() or _ended(page), "the end of the page", 120.0)
+
+
+def _ended(process: Path) -> bool:
+    """Whether a process has ended, and only its parent has not noticed."""
+    try:
+        return process.joinpath("stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_a_live_view_of_a_grid_is_refused(capsys):
+    assert train(["--envs", "push,door", "--watch"]) == 2
+    assert "--watch shows one run" in capsys.readouterr().err
+    assert main(["--watch"]) == 2
+    assert "need --run" in capsys.readouterr().err
 
 
 def test_a_run_that_is_none_is_refused(capsys):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from rmp_mjx.viewer.page import Page
+from rmp_mjx.viewer.spring import STRONGEST, pull
 from tests.viewer import chromium
 
 needs_chromium = pytest.mark.skipif(bool(chromium.missing()), reason=chromium.missing())
@@ -191,6 +192,33 @@ def test_paused_users_step_scrub_and_go_on_from_the_past(page):
     page.order(drive.clock.go_on_from_there)
     chromium.wait(lambda: not page.player.paused, "the end of the pause")
     assert past < session.time < time
+
+
+def test_a_link_that_is_dragged_gives_way_until_its_users_let_go(page):
+    session, spring = page.session, page.drive.spring
+    link = session.robot.body_names[-1]
+    page.order(lambda: spring.choose(link))
+    chromium.wait(lambda: spring.handle is not None, "a handle")
+    assert session.push is None  # a handle on its link pulls nothing
+    before = session.hand()
+    spring.handle.position = session.body(link) + np.array([0.0, 0.2, 0.0])
+    page.order(spring.drag)
+    chromium.wait(lambda: session.push is not None, "a force")
+    name, force = session.push or ("", np.zeros(3))
+    # 200 N/m over 20 cm; the link has moved by some centimetres at most since then
+    assert name == link and 20.0 < force[1] <= 41.0
+    chromium.wait(lambda: bool(session.hand()[1] > before[1] + 0.01), "a motion")
+    assert spring._label.text.endswith(" N") and spring._arrow.visible
+    page.order(page.drive._home)
+    chromium.wait(lambda: spring.handle is None, "the end of the pull")
+    assert session.push is None and not spring._arrow.visible
+
+
+def test_a_spring_pulls_no_more_than_its_greatest_force():
+    near, far = np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 9.0])
+    assert np.allclose(pull(np.zeros(3), near), 200.0 * near)
+    assert np.allclose(pull(np.zeros(3), far), [0.0, 0.0, STRONGEST])
+    assert not pull(near, near).any()
 
 
 def test_orders_that_make_no_sense_are_answered_not_obeyed(page):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,13 +62,32 @@ def record_episodes(
     return recorder(env, num_episodes, recorded)(agent, key)
 
 
+def whole(state: Any, action: Array) -> Any:
+    """What a recording keeps of a step unless it is told otherwise: the state."""
+    return state
+
+
 def recorder(
-    env: Env, num_episodes: int, recorded: int
+    env: Env,
+    num_episodes: int,
+    recorded: int,
+    keep: Callable[[Any, Array], Any] = whole,
+    most: int | None = None,
 ) -> Callable[[Agent, PRNGKeyArray], tuple[Episodes, Recording]]:
-    """`record_episodes` for several agents; compiled once for those of one network."""
+    """`record_episodes` for several agents; compiled once for those of one network.
+
+    Args:
+        env: Single environment.
+        num_episodes: Number of episodes.
+        recorded: How many of them to record.
+        keep: What to record of the states (b, ...) and the actions (b, m) that follow
+            them; after the last step, an action that is not taken.
+        most: Policy steps of an episode to record at most; None: `MAX_STEPS`.
+    """
     check_size(env, num_episodes)
-    run = jax.jit(partial(play, env, num_episodes, min(recorded, num_episodes)))
-    steps = min(env.episode_length, recording.MAX_STEPS)
+    steps = min(env.episode_length, most or recording.MAX_STEPS)
+    taped = Taped(min(recorded, num_episodes), steps, keep)
+    run = jax.jit(partial(play, env, num_episodes, taped))
 
     def record(agent: Agent, key: PRNGKeyArray) -> tuple[Episodes, Recording]:
         bound = agent if isinstance(agent, Partial) else Partial(agent)
@@ -98,6 +117,17 @@ def check_size(env: Env, num_episodes: int) -> None:
     devices.check_memory(needed, jax.local_devices(), "the number of episodes")
 
 
+class Taped(NamedTuple):
+    """What of an evaluation is recorded."""
+
+    episodes: int
+    """How many, from the first one."""
+    steps: int
+    """How many policy steps of each."""
+    keep: Callable[[Any, Array], Any] = whole
+    """What of states and actions."""
+
+
 class _Lanes(Pytree):
     """Environments that work through the episodes."""
 
@@ -114,7 +144,7 @@ class _Lanes(Pytree):
 
 
 def play(
-    env: Env, num: int, recorded: int, agent: Agent, key: PRNGKeyArray
+    env: Env, num: int, taped: Taped, agent: Agent, key: PRNGKeyArray
 ) -> tuple[dict[str, Any], Any]:
     """Work through episodes in lanes; what `recorder` compiles.
 
@@ -127,7 +157,7 @@ def play(
     count = min(num, LANES)
     mesh = devices.local_mesh(count)
     advance = devices.per_device(partial(finite_step, env), mesh, (0, 0), 0)
-    steps = min(env.episode_length, recording.MAX_STEPS)
+    keep = taped.keep
 
     def reset(episode):
         fresh = jax.vmap(env.reset)(starts[jnp.minimum(episode, num - 1)])
@@ -155,10 +185,11 @@ def play(
         lanes, taken = jax.lax.cond(
             enough & (taken < num), refill, lambda *same: same, lanes, taken
         )
-        tape = recording.store(
-            tape, lanes.state, lanes.episode, lanes.fold.length, ~lanes.idle
-        )
         action = agent(lanes.state.obs, jax.random.fold_in(key_act, t))
+        kept = keep(lanes.state, action)
+        tape = recording.store(
+            tape, kept, lanes.episode, lanes.fold.length, ~lanes.idle
+        )
         new, finite = advance(lanes.state, action)
         fold = episodes.update(lanes.fold, new.reward, new.metrics, kinds)
         ended = (new.done > 0.5) | (fold.length >= env.episode_length)
@@ -169,9 +200,8 @@ def play(
             idle=lanes.idle | ended,
             lost=lanes.lost | ~(lanes.idle | finite),
         )
-        tape = recording.store(
-            tape, lanes.state, lanes.episode, lanes.fold.length, lanes.idle
-        )
+        kept = keep(lanes.state, action)
+        tape = recording.store(tape, kept, lanes.episode, lanes.fold.length, lanes.idle)
         # Final for those that have ended; the others overwrite it.
         results = jax.tree.map(
             lambda every, own: every.at[lanes.episode].set(own),
@@ -190,7 +220,9 @@ def play(
         lost=nobody,
     )
     results = episodes.start(kinds, (num,)), jnp.zeros(num, bool)
-    tape = recording.blank(blank, recorded, steps)
+    kept = jax.eval_shape(keep, blank, jnp.zeros((count, env.action_size)))
+    kept = jax.tree.map(_zeros, kept)
+    tape = recording.blank(kept, taped.episodes, taped.steps)
     start = (lanes, jnp.int32(0), results, tape, jnp.int32(0))
     _, _, (fold, lost), tape, _ = jax.lax.while_loop(unfinished, step, start)
     return episodes.finish(fold, kinds) | {"lost": lost}, tape

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int
 from rmp_mjx.trees import numbers
 
 MAX_STEPS = 400
-"""Policy steps of an episode that are kept."""
+"""Policy steps of an episode that are kept for pictures."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,17 @@ class Recording:
     states: Any
     """Environment states, (steps + 1, k) leading, NumPy; keys as their raw data."""
     lengths: Int[np.ndarray, " k"]
-    """Steps of each episode, `MAX_STEPS` at most."""
+    """Steps of each episode, as far as they are kept."""
 
     @property
     def count(self) -> int:
         """Number of episodes k."""
         return len(self.lengths)
+
+    def first(self, count: int) -> "Recording":
+        """The beginnings of the first `count` episodes (or all), for pictures."""
+        states = jax.tree.map(lambda x: x[: MAX_STEPS + 1, :count], self.states)
+        return Recording(states, np.minimum(self.lengths[:count], MAX_STEPS))
 
     def state(self, episode: int, step: int) -> Any:
         """The state of one episode after so many steps; its last one beyond its end."""

@@ -19,7 +19,7 @@ ACTION, ABOUT = "action", "about"
 """Entries of a file in addition to the leaves of the state."""
 PLACE = ("iteration", "seed", "lane")
 """What a file says of where its step was."""
-_UNREADABLE = (
+UNREADABLE = (
     OSError,
     KeyError,
     IndexError,
@@ -99,7 +99,7 @@ def load(path: Path, template: Any) -> tuple[Any, Float[np.ndarray, " m"]]:
     try:
         with np.load(path) as stored:
             arrays = {name: stored[name] for name in (ACTION, *wanted)}
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise ValueError(f"{path} is damaged, or of another task: {error}") from error
     for name, leaf in wanted.items():
         shape = jax.eval_shape(numbers, leaf).shape
@@ -122,5 +122,5 @@ def about(path: Path) -> dict[str, Any]:
         with np.load(path) as stored:
             found = json.loads(str(stored[ABOUT]))
         return {name: found[name] for name in ("config", *PLACE)} | found
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise ValueError(f"{path} is no dump of a non-finite step: {error}") from error

@@ -50,6 +50,8 @@ INSTANCE = "instance.png"
 STORYBOARD = "storyboard.png"
 VIDEO = "video.mp4"
 PAGE = "report.html"
+WORST = "worst"
+WORST_INDEX = f"{WORST}/index.json"
 LOCK = "lock"
 PACKAGES = (
     "jax",
@@ -83,6 +85,7 @@ RESULTS = (
     STORYBOARD,
     VIDEO,
     PAGE,
+    WORST,
 )
 
 

@@ -52,6 +52,27 @@ def test_few_lanes_work_through_many_episodes(results, recorded, monkeypatch):
         assert seen == list(range(length + 1))
 
 
+def test_a_recording_keeps_what_it_is_told_and_changes_no_number(results):
+    def keep(state, action):
+        return {"seen": state.obs, "action": action}
+
+    agent, most = random_agent(1), 3
+    record = evaluate.recorder(toys.Counter(), EPISODES, EPISODES, keep, most)
+    again, tape = record(agent, KEY)
+    for name, values in results.items():
+        np.testing.assert_array_equal(again[name], values)
+    assert set(tape.states) == {"seen", "action"}
+    np.testing.assert_array_equal(tape.lengths, np.minimum(results["length"], most))
+    for episode, length in enumerate(tape.lengths.tolist()):
+        taken = [tape.state(episode, t)["action"][0] for t in range(length)]
+        assert len(set(map(float, taken))) == length  # a random one for each step
+        if length == results["length"][episode]:
+            effort = np.abs(taken).mean()
+            # a mean of at most three numbers in float32
+            assert effort == pytest.approx(results["effort"][episode], rel=1e-5)
+    assert tape.first(2).count == 2
+
+
 def test_agents_with_the_same_key_meet_the_same_tasks(results):
     other = evaluate.run_episodes(toys.Counter(), zero_agent(1), EPISODES, KEY)
     np.testing.assert_array_equal(other["length"], results["length"])

@@ -1,0 +1,103 @@
+"""A task in the browser: the scene of a moment of an episode, and its clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from rmp_mjx.viewer.clock_panel import ClockPanel
+from rmp_mjx.viewer.drawing import Bodies, mesh_parts
+from rmp_mjx.viewer.loop import Loop
+from rmp_mjx.viewer.player import Simulation
+
+from .base import ArmEnv
+from .play import Moment
+from .types import State
+
+
+class TaskPage(Loop[Moment]):
+    """The scene of a task, and the moments of a simulation in it."""
+
+    def __init__(
+        self,
+        simulation: Simulation[Moment],
+        env: ArmEnv,
+        title: str,
+        port: int,
+        folder: Path,
+    ):
+        """Start the server.
+
+        Args:
+            simulation: What is shown.
+            env: Its task.
+            title: Heading of the panel.
+            port: Where the page is; the next free one if it is taken.
+            folder: Where recordings go.
+        """
+        super().__init__(simulation, title, port, folder)
+        self.env = env
+        model = env.scene.model
+        self._data = mujoco.MjData(model)
+        parts = mesh_parts(model, range(model.ngeom))
+        self._bodies = Bodies(self.server.scene, model, "/task", parts)
+        self._marks: dict[tuple, Any] = {}
+        eye, middle = _camera(env)
+        self.server.initial_camera.position = eye
+        self.server.initial_camera.look_at = middle
+        self.status = self.server.gui.add_markdown("compiling ...")
+        self.clock = ClockPanel(self)
+
+    def refuse(self, error: ValueError) -> None:
+        """Say why an order is not obeyed."""
+        self.clock.saved.content = f"**{error}**"
+
+    def draw(self, frame: Moment) -> None:
+        """Show a moment in all browsers."""
+        state = frame.state
+        self._data.qpos[:] = np.asarray(state.data.qpos)
+        if self._data.mocap_pos.size:
+            self._data.mocap_pos[:] = np.asarray(state.data.mocap_pos)
+        mujoco.mj_kinematics(self.env.scene.model, self._data)
+        with self.server.atomic():
+            self._bodies.move(self._data)
+            self._draw_marks(state)
+        events = ", ".join(f"{k} {v}" for k, v in frame.events.items()) or "none"
+        self.status.content = (
+            f"episode {frame.episode}, step {int(state.info['step'])} of "
+            f"{self.env.episode_length}, return {frame.reward:.1f}  \n"
+            f"policy steps with events: {events}"
+        )
+        self.clock.show()
+
+    def _draw_marks(self, state: State) -> None:
+        shown = {}
+        for k, mark in enumerate(self.env.marks(state)):
+            key = (k, mark.shape, mark.radius, tuple(mark.color))
+            shown[key] = self._marks.get(key) or self._mark(k, mark)
+            shown[key].position = mark.place
+        for key in self._marks.keys() - shown.keys():
+            self._marks[key].visible = False
+        for key, handle in shown.items():
+            self._marks[key] = handle
+            handle.visible = True
+
+    def _mark(self, k: int, mark: Any) -> Any:
+        color = np.array([255 * c for c in mark.color[:3]], np.uint8)
+        name = f"/marks/{k}/{len(self._marks)}"
+        add = self.server.scene
+        if mark.shape == "ball":
+            return add.add_icosphere(name, mark.radius, color)
+        return add.add_cylinder(name, mark.radius, 0.002, color)
+
+
+def _camera(env: ArmEnv) -> tuple[np.ndarray, np.ndarray]:
+    """Where the camera is, and what it looks at: the task's view."""
+    middle, distance, azimuth, elevation = env.view
+    a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
+    ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    middle = np.asarray(middle, float)
+    return middle - distance * ahead, middle
