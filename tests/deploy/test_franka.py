@@ -172,11 +172,20 @@ def test_missing_bindings_are_named(deployed, monkeypatch):
         FrankaBackend(deployed, "x")
 
 
+def _only_late(found):
+    """Whether every show that failed did so by ticks of this machine that were late."""
+    shows = [*found["episodes"], *(found[x] for x in ("hold", "stale", "reflex"))]
+    late = "tick late", "communication_constraints_violation"
+    causes = [why for x in shows if not x["passed"] for why in x["aborts"]]
+    return bool(causes) and all(why.startswith(late) for why in causes)
+
+
 @pytest.mark.slow
 def test_the_policy_works_against_a_server_of_the_robots_protocol(root, tmp_path):
     """One episode with a sphere and one without; the rest of the demo besides.
 
-    It takes a minute, and both cores of a small machine.
+    It takes a minute, and both cores of a small machine. One that does not get to its
+    ticks in time, five times over, cannot tell.
     """
     server, bindings = root / "build/franka-sim", root / "build/pylibfranka"
     if not (server.exists() and bindings.exists()):
@@ -192,8 +201,11 @@ def test_the_policy_works_against_a_server_of_the_robots_protocol(root, tmp_path
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert rows.exists(), done.stdout + done.stderr
     found = json.loads(rows.read_text())
+    if done.returncode and _only_late(found):
+        pytest.skip(f"this machine is too busy for 1 kHz: {found['aborts']}")
+    assert done.returncode == 0, done.stdout + done.stderr
     assert [row["reached"] for row in found["episodes"]] == [4, 4]
     assert [row["sphere"] for row in found["episodes"]] == [False, True]
     assert all(row["clearance_cm"] > 0.0 for row in found["episodes"])
