@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from rmp_mjx.viewer import film
 from rmp_mjx.viewer.clock_panel import ClockPanel
 from rmp_mjx.viewer.drawing import Bodies, mesh_parts
 from rmp_mjx.viewer.loop import Loop
@@ -15,6 +17,7 @@ from rmp_mjx.viewer.player import Simulation
 
 from .base import ArmEnv
 from .play import Moment
+from .render import render
 from .types import State
 
 
@@ -72,6 +75,10 @@ class TaskPage(Loop[Moment]):
             f"policy steps with events: {events}"
         )
         self.clock.show()
+
+    def render(self, frames: Sequence[Moment]) -> list[np.ndarray]:
+        """Moments drawn by MuJoCo, with the task's marks."""
+        return render(self.env, [frame.state for frame in frames], film.SIZE, False)
 
     def _draw_marks(self, state: State) -> None:
         shown = {}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
+from rmp_mjx.viewer import film
 from rmp_mjx.viewer.loop import Loop
 from rmp_mjx.viewer.player import REMEMBERED
 
@@ -24,11 +26,13 @@ class ClockPanel:
         self.back = gui.add_slider("Seconds ago", 0.0, REMEMBERED, 0.05, 0.0)
         self.again = gui.add_button("Go on from there")
         self.record = gui.add_button("Record")
+        self.film = gui.add_button(f"Film of the last {film.SECONDS:g} s")
         self.saved = gui.add_markdown("")
         self.pause.on_click(lambda _: page.order(self.toggle))
         self.once.on_click(lambda _: page.order(self.step_once))
         self.again.on_click(lambda _: page.order(self.go_on_from_there))
         self.record.on_click(lambda _: page.order(self.start_or_save))
+        self.film.on_click(lambda _: page.order(self.make_film))
         self.speed.on_update(lambda _: page.order(self._turn))
         self.back.on_update(lambda _: page.order(self._look_back))
 
@@ -60,6 +64,26 @@ class ClockPanel:
         else:
             recording.start()
             self.saved.content = ""
+
+    def make_film(self) -> threading.Thread:
+        """Make an MP4 in a thread of its own: the page goes on."""
+
+        def work() -> None:
+            try:
+                path = film.make(self.player.simulation, page.render, page.folder)
+                said = f"Saved `{path}`"
+            except ValueError as error:
+                said = f"**{error}**"
+            page.order(lambda: self._say(said))
+
+        page = self.page
+        self.saved.content = "drawing a film ..."
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        return thread
+
+    def _say(self, text: str) -> None:
+        self.saved.content = text
 
     def to_now(self) -> None:
         """Put the slider back."""

@@ -6,10 +6,11 @@ import abc
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Generic
 
+import numpy as np
 import viser
 
 from rmp_mjx.viewer.player import FrameT, Player, Simulation
@@ -47,6 +48,7 @@ class Loop(abc.ABC, Generic[FrameT]):
         self.server.gui.set_panel_label(title)
         self.server.scene.set_up_direction("+z")
         self.player = Player(simulation)
+        self.folder = folder
         self.recording = Recording(self.server, folder)
         self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stop = threading.Event()
@@ -54,6 +56,10 @@ class Loop(abc.ABC, Generic[FrameT]):
     @abc.abstractmethod
     def draw(self, frame: FrameT) -> None:
         """Show a frame in all browsers."""
+
+    @abc.abstractmethod
+    def render(self, frames: Sequence[FrameT]) -> list[np.ndarray]:
+        """Frames drawn by MuJoCo, (height, width, 3) each; another thread may ask."""
 
     @abc.abstractmethod
     def refuse(self, error: ValueError) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import viser
 
-from rmp_mjx.viewer import drawing, physics, texts
+from rmp_mjx.viewer import drawing, film, physics, texts
 from rmp_mjx.viewer.charts import Charts
 from rmp_mjx.viewer.dial_panel import DialPanel
 from rmp_mjx.viewer.drive_panel import DrivePanel
@@ -18,6 +19,8 @@ from rmp_mjx.viewer.thing_panel import ThingPanel
 
 _SLOW = 6
 """Bars and charts change with every so many pictures."""
+EYE, MIDDLE = (1.05, -0.95, 0.95), (0.3, 0.05, 0.4)
+"""Where the camera is at first, and what it looks at [m]."""
 GHOSTS = ((235, 120, 30), (60, 160, 80), (150, 80, 190))
 """Colors of the second arm and the others."""
 
@@ -83,11 +86,39 @@ class Page(Stage):
         self.drive.clock.show()
         self.pictures += 1
 
+    def render(self, frames: Sequence[Frame]) -> list[np.ndarray]:
+        """Frames drawn by MuJoCo: arms and things, seen as at first."""
+        model = film.lit(self.session.model)
+        things, arm = mujoco.MjData(model), mujoco.MjData(model)
+        seen, drawn = film.camera(np.array(EYE), np.array(MIDDLE)), []
+        movable = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
+        with mujoco.Renderer(model, *film.SIZE) as renderer:
+            for frame in frames:
+                physics.resize(model, frame.things, self.session.floor)
+                physics.place(model, things, frame.things)
+                physics.place(model, arm, ())
+                things.qpos[:] = frame.arms[0].q
+                mujoco.mj_forward(model, things)
+                renderer.update_scene(things, seen)
+                for other in frame.arms[1:]:
+                    arm.qpos[:] = other.q
+                    mujoco.mj_forward(model, arm)
+                    mujoco.mjv_addGeoms(
+                        model,
+                        arm,
+                        mujoco.MjvOption(),
+                        mujoco.MjvPerturb(),
+                        movable,
+                        renderer.scene,
+                    )
+                drawn.append(renderer.render().copy())
+        return drawn
+
     def _build(self) -> None:
         """Make the scene and the panels."""
         server = self.server
-        server.initial_camera.position = (1.05, -0.95, 0.95)
-        server.initial_camera.look_at = (0.3, 0.05, 0.4)
+        server.initial_camera.position = EYE
+        server.initial_camera.look_at = MIDDLE
         server.scene.add_grid("/grid", 4.0, 4.0, cell_size=0.1, section_size=0.5)
         self._arms: list[drawing.Bodies] = []
         self._fit_arms(1)

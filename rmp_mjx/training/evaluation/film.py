@@ -14,6 +14,7 @@ from rich.console import Console
 from rmp_mjx import runtime
 from rmp_mjx.training.evaluation.recording import Recording
 from rmp_mjx.training.runs import run_folder
+from rmp_mjx.video import write_video
 
 Frame = UInt8[np.ndarray, "h w 3"]
 Draw = Callable[[Sequence[Any], tuple[int, int], bool], list[Frame]]
@@ -55,7 +56,7 @@ def publish(
         stills = storyboard(draw, recording)
         mediapy.write_image(folder / run_folder.STORYBOARD, stills)
         video = grid(draw, recording)
-        _write_video(video, folder / run_folder.VIDEO, 1.0 / (STRIDE * dt))
+        write_video(folder / run_folder.VIDEO, video, 1.0 / (STRIDE * dt))
     except Exception as error:  # graphics stacks fail in many ways; numbers are safe
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         console.print(f"no pictures: {reason}", markup=False, highlight=False)
@@ -83,12 +84,3 @@ def grid(draw: Draw, recording: Recording) -> list[Frame]:
         rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
         frames.append(np.concatenate([np.concatenate(r, axis=1) for r in rows]))
     return frames
-
-
-def _write_video(frames: Sequence[Frame], path: Path, fps: float) -> None:
-    """Write an MP4 with the bundled encoder."""
-    import imageio_ffmpeg
-    import mediapy
-
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    mediapy.write_video(path, frames, fps=fps)
