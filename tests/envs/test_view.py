@@ -16,6 +16,7 @@ from envs import play as playing
 from envs import view, watch
 from envs.cli import make_config
 from envs.train import main as train
+from rmp_mjx import runtime
 from rmp_mjx.training.learning.networks import zero_agent
 from rmp_mjx.viewer.__main__ import main
 from tests.viewer.chromium import wait
@@ -72,6 +73,9 @@ def test_the_page_draws_the_task_and_takes_orders(play, tmp_path):
         assert "episode" in page.status.content
         page.clear()
         assert play.dropped == {}
+        if runtime.choose_gl() is not None:  # else no film can be made
+            (picture,) = page.render([play.now])
+            assert picture.shape == (480, 640, 3) and picture.std() > 5.0
     finally:
         page.server.stop()
 
