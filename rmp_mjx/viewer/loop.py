@@ -50,7 +50,7 @@ class Loop(abc.ABC, Generic[FrameT]):
         self.player = Player(simulation)
         self.folder = folder
         self.recording = Recording(self.server, folder)
-        self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stop = threading.Event()
 
     @abc.abstractmethod
@@ -70,7 +70,7 @@ class Loop(abc.ABC, Generic[FrameT]):
         """Address of the page."""
         return f"http://{HOST}:{self.server.get_port()}"
 
-    def order(self, what: Callable[[], None]) -> None:
+    def order(self, what: Callable[[], object]) -> None:
         """Let the loop do something between two steps; for other threads."""
         self._orders.put(what)
 

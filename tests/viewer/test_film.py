@@ -2,6 +2,7 @@
 
 import collections
 from types import SimpleNamespace
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -12,7 +13,7 @@ from rmp_mjx.viewer import film
 from rmp_mjx.viewer.page import Page
 
 
-def simulation(period, frames):
+def simulation(period, frames) -> Any:
     return SimpleNamespace(period=period, history=collections.deque(range(frames)))
 
 
