@@ -146,7 +146,7 @@ def rows_of(name: str, looks: Sequence[tuple[int, np.ndarray]]) -> list[Row]:
     )
     first, last = (float(looks[k][1].mean()) for k in (0, -1))
     return [
-        Row(f"{name}/steps", float(np.median(steps)), "steps", note),
+        Row(f"{name}/arrived", int(np.isfinite(steps).sum()), "seeds", note),
         Row(f"{name}/success_at_start", first, "share", "mean of the seeds"),
         Row(f"{name}/success_at_end", last, "share", f"by policy steps: {shares}"),
     ]

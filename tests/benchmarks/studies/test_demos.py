@@ -18,7 +18,7 @@ def test_a_seed_is_there_at_its_first_two_good_looks_in_a_row():
 
 
 def test_the_rows_have_every_seed_and_the_whole_curve():
-    steps, first, last = demos.rows_of("demos", LOOKS)
-    assert steps.value == 150.0 and steps.note.endswith("0, 100, 200, never")
+    arrived, first, last = demos.rows_of("demos", LOOKS)
+    assert arrived.value == 3 and arrived.note.endswith("0, 100, 200, never")
     assert (first.key, first.value) == ("demos/success_at_start", 0.5125)
     assert "300: 0.50, 1.00, 0.98, 0.20" in last.note
