@@ -27,6 +27,7 @@ LAW = {
     "xla": set(),
     "files": set(),
     "runtime": set(),
+    "video": set(),
     "types": GROUND,
     "vec": GROUND,
     "rmp": GROUND | {"vec"},
@@ -35,13 +36,13 @@ LAW = {
     "robot": BASE | {"rmp", "obstacles"},
     "control": BASE | {"rmp", "shapes", "obstacles", "robot"},
     "sim": BASE | {"obstacles", "robot", "runtime"},
-    "training": GROUND | {"types", "runtime", "files"},
+    "training": GROUND | {"types", "runtime", "files", "video"},
     "check_robot": BASE
     | {"rmp", "shapes", "obstacles", "robot", "control", "sim", "runtime", "files"},
     "report": {"fields", "files", "training"},
     "deploy": BASE | {"files", "obstacles", "robot", "control"},
     "viewer": BASE
-    | {"rmp", "shapes", "obstacles", "robot", "control", "runtime", "files"},
+    | {"rmp", "shapes", "obstacles", "robot", "control", "runtime", "files", "video"},
     "commands": {"check_robot"},
     "facade": BASE | {"rmp", "obstacles", "robot", "control", "sim"},
     "rmp_mjx": {"facade"},
