@@ -26,8 +26,6 @@ from .types import State
 
 BY_HAND = 3
 """Spheres that users can drop into a task, besides its own."""
-
-
 EVENTS = ("success", "collision", "self_collision", "joint_limit")
 """What is counted."""
 

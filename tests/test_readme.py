@@ -68,6 +68,11 @@ def namespace(document: Path) -> dict[str, Any]:
     return names
 
 
+@pytest.mark.parametrize("size", SMALLER)
+def test_what_is_made_smaller_is_in_a_document(size):
+    assert any(size in b for d in DOCUMENTS for b in blocks(d, "python"))
+
+
 @pytest.mark.parametrize(
     "document", [d for d in DOCUMENTS if blocks(d, "python")], ids=lambda d: d.stem
 )

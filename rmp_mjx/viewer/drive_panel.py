@@ -31,7 +31,6 @@ class DrivePanel:
         self.kp_pos = gui.add_slider("Stiffness", 10.0, 600.0, 5.0, KP)
         self.kp_ori = gui.add_slider("Turning stiffness", 10.0, 600.0, 5.0, KP)
         bodies = [NOBODY, *page.session.robot.body_names]
-        bodies = [NOBODY, *page.session.robot.body_names]
         self.spring = Spring(page)
         self.pushed = gui.add_dropdown("Pull the link", bodies, initial_value=NOBODY)
         self.release = gui.add_button("Let go")

@@ -91,26 +91,20 @@ class Page(Stage):
         model = film.lit(self.session.model)
         things, arm = mujoco.MjData(model), mujoco.MjData(model)
         seen, drawn = film.camera(np.array(EYE), np.array(MIDDLE)), []
+        look, hand = mujoco.MjvOption(), mujoco.MjvPerturb()
         movable = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
+        physics.place(model, arm, ())
         with mujoco.Renderer(model, *film.SIZE) as renderer:
             for frame in frames:
                 physics.resize(model, frame.things, self.session.floor)
                 physics.place(model, things, frame.things)
-                physics.place(model, arm, ())
                 things.qpos[:] = frame.arms[0].q
                 mujoco.mj_forward(model, things)
                 renderer.update_scene(things, seen)
                 for other in frame.arms[1:]:
                     arm.qpos[:] = other.q
                     mujoco.mj_forward(model, arm)
-                    mujoco.mjv_addGeoms(
-                        model,
-                        arm,
-                        mujoco.MjvOption(),
-                        mujoco.MjvPerturb(),
-                        movable,
-                        renderer.scene,
-                    )
+                    mujoco.mjv_addGeoms(model, arm, look, hand, movable, renderer.scene)
                 drawn.append(renderer.render().copy())
         return drawn
 
