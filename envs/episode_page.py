@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
 from rmp_mjx import runtime
-from rmp_mjx.training.config import ConfigError
 from rmp_mjx.training.runs import policies, run_folder
 
 from . import worst
@@ -53,6 +49,7 @@ class EpisodePage(TaskPage):
         Raises:
             ValueError: A file is none of an episode.
         """
+        runtime.configure()
         kept = worst.load(files[0])
         title = f"Worst episodes: {kept.env.options.title}"
         super().__init__(Episode(kept), kept.env, title, port, folder)
@@ -123,26 +120,3 @@ def of_run(run: str) -> list[Path]:
             f"{folder} has no worst episodes: `python eval.py --run {run}` keeps them"
         )
     return sorted(files, key=lambda file: worst.about(file)["clearance"])
-
-
-def main(
-    files: Sequence[Path], port: int, folder: Path, seconds: float | None = None
-) -> int:
-    """Show kept episodes; returns the exit code.
-
-    Args:
-        files: Episodes of one task.
-        port: Where the page is.
-        folder: Where recordings go.
-        seconds: End after so long; None: never.
-    """
-    try:
-        runtime.configure()
-        page = EpisodePage(files, port, folder)
-    except (ConfigError, ValueError, OSError) as error:
-        say = partial(Console(stderr=True).print, markup=False, highlight=False)
-        say(f"error: {error}", soft_wrap=True)
-        return 2
-    Console().print(f"open {page.url}, end with Ctrl+C", markup=False, highlight=False)
-    page.run(seconds)
-    return 0

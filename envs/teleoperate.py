@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from .play import Moment
 from .task_page import TaskPage
@@ -89,28 +88,17 @@ def said(driven: Teleoperation) -> str:
     return f"{end}, {driven.length} steps; {kept}"
 
 
-def main(
-    env: str,
-    args: Sequence[str],
-    port: int,
-    folder: Path,
-    seconds: float | None = None,
-) -> int:
-    """Let a person drive in a task; returns the exit code.
+def page(env: str, args: Sequence[str], port: int, folder: Path) -> DrivePage:
+    """The page of a task that a person drives.
 
     Args:
         env: Name of the task.
         args: Flags of its options, as for `eval.py`.
         port: Where the page is.
         folder: Where demonstrations and recordings go.
-        seconds: End after so long; None: never.
+
+    Raises:
+        ValueError: There is no such task or option.
     """
-    try:
-        driven = load(env, args, folder)
-        page = DrivePage(driven, driven.env.options.title, port, folder)
-    except (ValueError, OSError) as error:
-        Console(stderr=True).print(f"error: {error}", markup=False, highlight=False)
-        return 2
-    Console().print(f"open {page.url}, end with Ctrl+C", markup=False, highlight=False)
-    page.run(seconds)
-    return 0
+    driven = load(env, args, folder)
+    return DrivePage(driven, driven.env.options.title, port, folder)

@@ -7,9 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import viser
-from rich.console import Console
-
-from rmp_mjx.training.config import ConfigError
 
 from .play import Play, load
 from .task_page import TaskPage
@@ -77,23 +74,16 @@ class PolicyPage(TaskPage):
         self._gizmos.clear()
 
 
-def main(
-    args: Sequence[str], port: int, folder: Path, seconds: float | None = None
-) -> int:
-    """Show a policy in its task; returns the exit code.
+def page(args: Sequence[str], port: int, folder: Path) -> PolicyPage:
+    """The page of a policy in its task.
 
     Args:
         args: Flags of `eval.py`.
         port: Where the page is.
         folder: Where recordings go.
-        seconds: End after so long; None: never.
+
+    Raises:
+        ValueError: The flags name no policy, or no task.
     """
-    try:
-        play, title = load(args)
-        page = PolicyPage(play, title, port, folder)
-    except (ConfigError, ValueError, OSError) as error:
-        Console(stderr=True).print(f"error: {error}", markup=False, highlight=False)
-        return 2
-    Console().print(f"open {page.url}, end with Ctrl+C", markup=False, highlight=False)
-    page.run(seconds)
-    return 0
+    play, title = load(args)
+    return PolicyPage(play, title, port, folder)

@@ -168,21 +168,19 @@ def watching(
             page.wait()
 
 
-def main(
-    args: Sequence[str],
-    port: int,
-    folder: Path,
-    seconds: float | None = None,
-    leash: bool = False,
-) -> int:
-    """Watch a run; returns the exit code.
+def page(
+    args: Sequence[str], port: int, folder: Path, leash: bool = False
+) -> WatchPage | None:
+    """The page of a run that is watched; None: its training has ended already.
 
     Args:
         args: Flags of `eval.py`: the run, and its task's name.
         port: Where the page is.
         folder: Where recordings go.
-        seconds: End after so long; None: never.
         leash: End when the standard input does.
+
+    Raises:
+        ValueError: There is no such run.
     """
     give_way()
     ended = threading.Event()
@@ -191,23 +189,17 @@ def main(
     run = Path(args[args.index("--run") + 1])
     while leash and not (run / run_folder.METRICS).exists():
         if ended.wait(0.5):
-            return 0
-    try:
-        options, config = cli.parse_eval(args)
-        if config is None or not run.is_dir():
-            raise ConfigError(f"{run} is no run folder: --watch follows a training")
-        runtime.configure()
-        env = task_with_room(options.task)
-        play = Play(env, zero_agent(env.action_size), options.seed, BY_HAND)
-        page = WatchPage(play, config, run, port, folder)
-    except (ConfigError, ValueError, OSError) as error:
-        Console(stderr=True).print(f"error: {error}", markup=False, highlight=False)
-        return 2
-    Console().print(f"open {page.url}", markup=False, highlight=False)
+            return None
+    options, config = cli.parse_eval(args)
+    if config is None or not run.is_dir():
+        raise ConfigError(f"{run} is no run folder: --watch follows a training")
+    runtime.configure()
+    env = task_with_room(options.task)
+    play = Play(env, zero_agent(env.action_size), options.seed, BY_HAND)
+    found = WatchPage(play, config, run, port, folder)
     if leash:
-        threading.Thread(target=_end, args=(ended, page), daemon=True).start()
-    page.run(seconds)
-    return 0
+        threading.Thread(target=_end, args=(ended, found), daemon=True).start()
+    return found
 
 
 def _hold(ended: threading.Event) -> None:

@@ -5,6 +5,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -22,62 +23,69 @@ def main(args: Sequence[str] | None = None) -> int:
     except ImportError as missing:
         _say(Console(stderr=True), f"error: pip install 'rmp-mjx[viewer]': {missing}")
         return 2
-    from rmp_mjx.viewer.page import Page
-    from rmp_mjx.viewer.session import Session
-
-    try:
-        options, rest = _parser().parse_known_args(arguments(args))
-        if options.run is not None or options.episode is not None:
-            with contextlib.suppress(KeyboardInterrupt):
-                return _task(options, rest)
-            return 0
-        if options.teleoperate is not None:
-            from rmp_mjx_envs import teleoperate
-
-            place = options.port, options.out, options.seconds
-            with contextlib.suppress(KeyboardInterrupt):
-                return teleoperate.main(options.teleoperate, rest, *place)
-            return 0
-        if options.worst or options.watch:
-            raise ValueError("--worst and --watch need --run RUN")
-        if rest:
-            raise ValueError(f"unknown: {' '.join(rest)}. See --help")
-        runtime.configure()
-        session = Session(Robot.load(options.robot), options.controller, options.scene)
-        page = Page(
-            session,
-            options.robot,
-            port=options.port,
-            show=options.show,
-            folder=options.out,
-        )
-    except (ValueError, OSError) as error:
-        _say(Console(stderr=True), f"error: {error}")
-        return 2
-    _say(Console(), f"open {page.url}, end with Ctrl+C")
     with contextlib.suppress(KeyboardInterrupt):
+        try:
+            options, rest = _parser().parse_known_args(arguments(args))
+            page = _page(options, rest)
+        except (ValueError, OSError) as error:
+            _say(Console(stderr=True), f"error: {error}")
+            return 2
+        if page is None:
+            return 0
+        hint = "" if options.watch else ", end with Ctrl+C"
+        _say(Console(), f"open {page.url}{hint}")
         page.run(options.seconds)
     return 0
 
 
-def _task(options: argparse.Namespace, rest: list[str]) -> int:
-    """Show a policy or kept episodes in a task; returns the exit code.
+def _page(options: argparse.Namespace, rest: list[str]) -> Any:
+    """The page that the options ask for; None: what it is to show has ended.
+
+    Raises:
+        ValueError: The options contradict each other, or there is no such thing.
+    """
+    if options.run is not None or options.episode is not None:
+        return _task(options, rest)
+    if options.teleoperate is not None:
+        from rmp_mjx_envs import teleoperate
+
+        return teleoperate.page(options.teleoperate, rest, options.port, options.out)
+    if options.worst or options.watch:
+        raise ValueError("--worst and --watch need --run RUN")
+    if rest:
+        raise ValueError(f"unknown: {' '.join(rest)}. See --help")
+    from rmp_mjx.viewer.page import Page
+    from rmp_mjx.viewer.session import Session
+
+    runtime.configure()
+    session = Session(Robot.load(options.robot), options.controller, options.scene)
+    return Page(
+        session,
+        options.robot,
+        port=options.port,
+        show=options.show,
+        folder=options.out,
+    )
+
+
+def _task(options: argparse.Namespace, rest: list[str]) -> Any:
+    """A page with a policy or kept episodes in a task.
 
     Raises:
         ValueError: The options contradict each other, or there is no such episode.
     """
     from rmp_mjx_envs import episode_page, view, watch
 
-    where = options.port, options.out, options.seconds
+    where = options.port, options.out
     if options.watch and options.run is not None:
-        return watch.main(["--run", options.run, *rest], *where, options.leash)
+        return watch.page(["--run", options.run, *rest], *where, options.leash)
     if options.run is not None and not options.worst:
-        return view.main(["--run", options.run, *rest], *where)
+        return view.page(["--run", options.run, *rest], *where)
     if rest or (options.run is not None and options.episode is not None):
         raise ValueError("give --episode FILE, or --run RUN --worst, and no other flag")
-    if options.episode is not None:
-        return episode_page.main([options.episode], *where)
-    return episode_page.main(episode_page.of_run(options.run), *where)
+    episode = options.episode
+    files = episode_page.of_run(options.run) if episode is None else [episode]
+    return episode_page.EpisodePage(files, *where)
 
 
 def _parser() -> argparse.ArgumentParser:
