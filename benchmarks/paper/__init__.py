@@ -4,8 +4,8 @@
 then writes the pages. Everything measured lies in parquet files with their provenance
 (`store`); figures, tables and pages are made from those alone.
 
-* `cells`: what is trained; `columns`: where it is deployed; `work`: the loop over both.
-* `training`, `deployment`, `failures`, `pictures`: how the store is filled.
-* `measures`, `targets`, `published`, `tables`: the numbers; `figures`, `page`,
-  `report`: the pages.
+* `cells`: what is trained, and where it is deployed.
+* `training`: the loop over both; with `deployment`, how the store is filled.
+* `measures`, `targets`, `tables`: the numbers; `figures`, `front`, `page`, `report`:
+  the pages.
 """

@@ -199,13 +199,23 @@ def rate(rows: pl.DataFrame, name: str) -> Rate:
     return Rate(int((rows[name] > 0.5).sum()), len(rows))
 
 
+EVENTS = ("collision", "self_collision", "joint_limit")
+"""What ends an episode."""
+
+
 def ended(rows: pl.DataFrame) -> Rate:
     """Episodes that any event ended."""
-    events = ("collision", "self_collision", "joint_limit")
     return Rate(
-        int(rows.select(pl.any_horizontal(pl.col(events) > 0.5)).sum().item()),
+        int(rows.select(pl.any_horizontal(pl.col(EVENTS) > 0.5)).sum().item()),
         len(rows),
     )
+
+
+def events(rows: pl.DataFrame) -> float:
+    """Events in some trainings, whose iterations all have the same number of steps."""
+    each = [f"per_1000_steps/{name}" for name in EVENTS]
+    seeds, last = rows["seed"].n_unique(), float(rows["steps"].max())  # pyright: ignore
+    return seeds * last / 1000.0 * sum(float(rows[name].mean()) for name in each)  # pyright: ignore
 
 
 class Mean(NamedTuple):
@@ -223,6 +233,21 @@ def mean(rows: pl.DataFrame, name: str) -> Mean:
     """Mean of a metric over episodes."""
     values = rows[name].to_numpy()
     return Mean(*mean_sd(values), bootstrap_mean(values))
+
+
+def gap(
+    ours: pl.DataFrame, base: pl.DataFrame, name: str, factor: float = 1.0
+) -> Interval:
+    """95 % bootstrap interval of the mean difference of a metric.
+
+    Args:
+        ours: Episodes of one.
+        base: As many of the other, from the same starts in the same order.
+        name: The metric.
+        factor: Of the differences.
+    """
+    differences = ours[name].to_numpy() - base[name].to_numpy()
+    return bootstrap_mean(factor * differences.astype(float))
 
 
 class Paired(NamedTuple):

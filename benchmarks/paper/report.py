@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import polars as pl
-
-from benchmarks.paper import cells, figures, measures, store, tables, targets
+from benchmarks.paper import cells, figures, front, measures, store, tables, targets
 from benchmarks.paper.cells import (
     COLUMNS,
     PAPER,
     PICTURED,
     TABLE,
-    TASKS,
     VARIANTS,
     Preset,
 )
@@ -22,7 +19,6 @@ from benchmarks.paper.store import Store
 from rmp_mjx.files import write_text
 
 FIGURES = "figures"
-TITLE = "The paper's experiments, measured"
 
 
 def write(place: Store, preset: Preset, folder: Path) -> Path:
@@ -43,7 +39,7 @@ def write(place: Store, preset: Preset, folder: Path) -> Path:
         raise ValueError(f"{place.folder} holds no finished training yet")
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
     blocks = [
-        *_summary(place, preset),
+        *front.blocks(place, preset, folder, FIGURES),
         *_targets(place),
         *_reproduction(place),
         *_training(place, folder),
@@ -58,46 +54,21 @@ def write(place: Store, preset: Preset, folder: Path) -> Path:
     return written
 
 
-def _summary(place: Store, preset: Preset) -> list[Block]:
-    trained = [a for a in place.provenance if a["kind"] == store.TRAINING]
-    wanted = preset.cells()
-    done = {(a["task"], a["variant"], a["seed"]) for a in trained}
-    missing = [c for c in wanted if (c.task, c.variant, c.seed) not in done]
-    text = (
-        "`{command}` made this page from {runs} training runs of {steps:,} policy "
-        "steps each and {episodes:,} episodes of deployment. The paper's two "
-        "controllers need {wanted} runs; {missing} of them are not trained yet."
-    ).format(
-        command=f"python -m benchmarks.paper --preset {preset.name}",
-        runs=len(trained),
-        steps=int(place.training["steps"].max()),  # pyright: ignore
-        episodes=len(place.episodes),
-        wanted=len(wanted),
-        missing=len(missing),
-    )
-    blocks: list[Block] = [Heading(TITLE, 1), Text(text)]
-    if preset.name == "smoke":
-        blocks.append(
-            Text("This is a smoke test: it shows that everything runs, nothing more.")
-        )
-    return blocks
-
-
 def _targets(place: Store) -> list[Block]:
     found = targets.targets(place)
-    verdicts = [target.verdict for target in found]
-    met, failed, undecided = map(verdicts.count, ("met", "NOT MET", "undecided"))
     return [
-        Heading("Targets"),
+        Heading("Every target"),
         Text(
-            f"Of {len(found)} targets {met} are met, {failed} are not, and "
-            f"{undecided} are undecided. Undecided means not measured, measured in "
-            "fewer than 100 episodes, or nothing to compare with. The measured value "
-            "decides; the interval shows its uncertainty. Intervals of changes are "
-            "paired bootstraps over seeds, for three seeds or more. Intervals of "
-            "shares are Clopper and Pearson's."
+            f"{front.verdicts(found)} The 95 % interval decides: a target is met where "
+            "all of the interval is on its side, not met where all of it is on the "
+            "other, else undecided. An event that must not happen is one that did not, "
+            f"in so many episodes that the interval ends below {targets.RARE} %. "
+            "Intervals of changes in training are paired over seeds: bootstraps, for "
+            "three seeds or more, and Student's t. Those of deployed returns and "
+            "successes are paired over the episodes of the best seeds, which have the "
+            "same starts. Intervals of shares are Clopper and Pearson's."
         ),
-        tables.of_targets(place),
+        tables.of_targets(found),
     ]
 
 
@@ -184,15 +155,8 @@ def _deployment(place: Store, folder: Path) -> list[Block]:
 
 
 def _beyond(place: Store, preset: Preset, folder: Path) -> list[Block]:
-    figures.pareto(place, folder / FIGURES / "pareto.png")
     figures.robustness(place, folder / FIGURES / "robustness.png", preset.columns)
     return [
-        Heading("Performance against safety"),
-        Picture(
-            Path(FIGURES, "pareto.png"),
-            "Success against episodes ended by an event, best seeds, with 95 % "
-            "intervals. Up and right is better.",
-        ),
         Heading("Robustness"),
         Picture(
             Path(FIGURES, "robustness.png"),
@@ -212,17 +176,10 @@ def _beyond(place: Store, preset: Preset, folder: Path) -> list[Block]:
 
 
 def _failures(place: Store, folder: Path) -> list[Block]:
-    chosen: list[pl.DataFrame] = []
-    for task in TASKS:
-        for variant in VARIANTS:
-            cell = figures.best_cell(place, task, variant)
-            if cell and not place.events.is_empty():
-                rows = {"task": task, "variant": variant, "seed": cell.seed}
-                chosen.append(measures.of(place.events, **rows))
-    events = pl.concat(chosen) if chosen else pl.DataFrame()
+    events = front.best_events(place)
     ours = measures.of(events, variant=targets.OURS)
     blocks: list[Block] = [
-        Heading("Where it still fails"),
+        Heading("What events were"),
         Text(
             "The events that ended recorded episodes. Recorded are the first 100 "
             f"episodes of the best seeds with {COLUMNS[PICTURED].label}. There were "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import polars as pl
 
@@ -43,8 +45,8 @@ def interval(bounds: Interval | None) -> str:
     return f"[{number(bounds[0])}, {number(bounds[1])}]" if bounds else MISSING
 
 
-def of_targets(place: Store) -> Table:
-    """The targets with what was measured."""
+def of_targets(found: Sequence[targets.Target]) -> Table:
+    """Targets with what was measured."""
     rows = [
         (
             target.claim,
@@ -53,7 +55,7 @@ def of_targets(place: Store) -> Table:
             target.interval or MISSING,
             target.verdict,
         )
-        for target in targets.targets(place)
+        for target in found
     ]
     return Table(("target", "task", "measured", "95 % interval", "verdict"), rows)
 

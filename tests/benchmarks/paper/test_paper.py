@@ -343,10 +343,28 @@ def test_what_is_packed_is_done_and_a_new_part_comes_before_it(
 
 def test_the_count_of_targets_is_that_of_the_tables_rows(page):
     text = page.read_text()
-    counts = [text.count(f"| {word} |") for word in ("met", "NOT MET", "undecided")]
+    first, _, rest = text.partition("## Every target")
+    words = ("met", "NOT MET", "undecided")
+    counts = [rest.count(f"| {word} |") for word in words]
     said = "Of {} targets {} are met, {} are not, and {} are undecided."
     assert sum(counts) == 33 and counts[2] < 33
-    assert said.format(33, *counts) in text
+    assert text.count(said.format(33, *counts)) == 2
+    assert [first.count(f"| {word} |") for word in words] == [0, *counts[1:]]
+
+
+def test_the_claim_counts_the_events_of_training(grid, page):
+    rows = grid[0].training.with_columns(
+        hits=pl.sum_horizontal(f"per_1000_steps/{name}" for name in measures.EVENTS)
+    )
+    steps = rows["steps"].min()  # of an iteration
+    events = {
+        variant: round(float(measures.of(rows, variant=variant)["hits"].sum()) * steps)
+        for variant in ("rmp_vices", "vices")
+    }
+    ours, base = (round(events[name] / 1000) for name in ("rmp_vices", "vices"))
+    assert 0 < ours < base
+    said = f"RMP-VICES had {ours:,} events and VICES {base:,}."
+    assert said in page.read_text().split("\n\n")[1]
 
 
 def test_targets_without_measurements_are_said_to_be_unmeasured(grid):
