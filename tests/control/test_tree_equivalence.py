@@ -77,24 +77,6 @@ def test_closed_form_is_the_autodiff_tree(run64, robot, inputs, varied):
         assert np.max(np.abs(a - b) / scale) < tolerance, name
 
 
-@pytest.mark.parametrize("push", [3.0, 300.0])
-def test_closed_form_is_the_autodiff_tree_in_contact(run64, robot, inputs, push):
-    """Random contact torques, small ones and some beyond the cap: 1e-9 likewise."""
-    rng = np.random.default_rng(1)
-    tau_ext = push * rng.normal(size=(len(inputs[0]), 7)) * robot.tau_max / 30.5
-    fast = run64(RMPVICES(robot), *inputs, tau_ext)
-    slow = run64(Definition(robot), *inputs, tau_ext)
-    alone = run64(RMPVICES(robot), *inputs)
-    for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("qdd", 1e-7), ("tau", 1e-7)):
-        a, b, c = (
-            getattr(out, name).reshape(len(inputs[0]), -1)
-            for out in (fast, slow, alone)
-        )
-        scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
-        assert np.max(np.abs(a - b) / scale) < tolerance, name
-        assert np.max(np.abs(a - c) / scale) > 1e-3, name
-
-
 def test_the_closed_form_evaluates_no_task_map(monkeypatch, ctrl, robot, inputs):
     """So the tests above compare two programs, not one with itself."""
 
@@ -122,20 +104,33 @@ def weighted(robot):
     return RMPVICES(robot, action_range=WeightedActionRange())
 
 
-def test_a_policys_weights_are_those_of_the_autodiff_tree(
-    run64, robot, inputs, varied, weighted
+@pytest.mark.parametrize("push", [3.0, 300.0])
+def test_closed_form_is_the_autodiff_tree_in_contact_and_weighed(
+    run64, robot, inputs, varied, weighted, push
 ):
-    """The tolerances of `test_closed_form_is_the_autodiff_tree`."""
+    """Random weights, and contact torques that are small or beyond the cap.
+
+    The tolerances of `test_closed_form_is_the_autodiff_tree`. Both matter.
+    """
+    rng = np.random.default_rng(1)
+    count = len(inputs[0])
+    tau_ext = push * rng.normal(size=(count, 7)) * robot.tau_max / 30.5
+    args = with_weights(inputs, rng.uniform(-1.0, 1.0, (count, 3)))
     leaves = Leaves.default(robot).with_collision(varied)
-    entries = np.random.default_rng(5).uniform(-1.0, 1.0, (len(inputs[0]), 3))
-    args = with_weights(inputs, entries)
-    fast = run64(weighted.replace(leaves=leaves), *args)
+    closed = weighted.replace(leaves=leaves)
+    fast = run64(closed, *args, tau_ext)
+    alone = run64(closed, *args, 0.0 * tau_ext)
+    even = run64(closed, *with_weights(inputs, 0.0), tau_ext)
     kind = Definition(robot, leaves, action_range=WeightedActionRange())
-    slow = run64(kind, *args)
-    for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("tau", 1e-7)):
-        a, b = (getattr(out, name).reshape(len(inputs[0]), -1) for out in (fast, slow))
+    slow = run64(kind, *args, tau_ext)
+    for name, tolerance in (("f", 1e-9), ("M", 1e-9), ("qdd", 1e-7), ("tau", 1e-7)):
+        a, b, *others = (
+            getattr(out, name).reshape(count, -1) for out in (fast, slow, alone, even)
+        )
         scale = np.abs(b).max(axis=1, keepdims=True) + 1e-6
         assert np.max(np.abs(a - b) / scale) < tolerance, name
+        for other in others:
+            assert np.max(np.abs(a - other) / scale) > 1e-3, name
 
 
 def test_a_policy_that_weighs_nothing_has_the_default_tree(
@@ -217,21 +212,15 @@ def test_the_heaviest_posture_takes_little_from_a_safety_leaf_at_its_cap(ctrl):
             np.testing.assert_allclose(found, shares, rtol=0.5)
 
 
-def test_one_leaf_is_the_same_leaf_for_every_kind(robot, inputs, fast):
+def test_one_leaf_is_the_same_leaf_for_every_kind(run64, robot, inputs, fast):
     """To rounding: 1e-9 of the largest entry."""
     near, n = collision_near(), len(robot.points.segment)
     each = {"boxes": near, "planes": near.replace(mu=np.full(n, near.mu))}
     split: Any = RMPVICES(robot).with_collision(each)
     assert split.leaves.collision["spheres"] == near
-    for k in range(3):
-        q, qd, action, obstacles = jax.tree.map(lambda x, k=k: x[k], inputs)
-        with jax.enable_x64(True):
-            out = jax.device_get(
-                split(q, qd, split.setpoint(q, split.decode(action), 0.0), obstacles)
-            )
-        np.testing.assert_allclose(
-            out.M, fast.M[k], rtol=0, atol=1e-9 * np.abs(fast.M[k]).max()
-        )
+    out = run64(split, *inputs)
+    scale = np.abs(fast.M).max(axis=(1, 2), keepdims=True)
+    assert np.max(np.abs(out.M - fast.M) / scale) < 1e-9
 
 
 def test_unknown_kind_of_obstacle_is_refused(robot):
