@@ -67,6 +67,7 @@ def test_benchmark_states_are_reproducible_and_inside_the_limits():
     assert int(obstacles.spheres.active.sum()) == bench_controller.SPHERES
 
 
+@pytest.mark.slow
 def test_a_process_that_is_to_take_the_first_step_prints_its_seconds(
     monkeypatch, capsys
 ):
