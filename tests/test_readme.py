@@ -68,13 +68,22 @@ def namespace(document: Path) -> dict[str, Any]:
     return names
 
 
+SLOW = ("brax",)
+"""Documents whose blocks compile other trainers."""
+
+
 @pytest.mark.parametrize("size", SMALLER)
 def test_what_is_made_smaller_is_in_a_document(size):
     assert any(size in b for d in DOCUMENTS for b in blocks(d, "python"))
 
 
 @pytest.mark.parametrize(
-    "document", [d for d in DOCUMENTS if blocks(d, "python")], ids=lambda d: d.stem
+    "document",
+    [
+        pytest.param(d, id=d.stem, marks=[pytest.mark.slow] * (d.stem in SLOW))
+        for d in DOCUMENTS
+        if blocks(d, "python")
+    ],
 )
 def test_the_python_blocks_of_a_document_run_in_order(document):
     assert namespace(document)

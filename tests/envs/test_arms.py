@@ -108,6 +108,7 @@ def ur5e():
     return envs.load("trajectory", robot="ur5e", physics="mujoco", start_noise=0.0)
 
 
+@pytest.mark.slow
 def test_an_expert_follows_the_via_points_with_six_joints(ur5e):
     """All of eight episodes within 100 steps; each takes some 30."""
     metrics = experts.play(ur5e, experts.follow, 8, 100, 0)

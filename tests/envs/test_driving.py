@@ -138,6 +138,7 @@ def test_clearance_of_the_tree_is_mujocos_distance(make, start, arm):
     assert float(out.diagnostics["clearance"]) == pytest.approx(nearest, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_both_engines_step_the_task_alike(make, close, quiet):
     """Free motion, then one lane falls onto the table.
 

@@ -340,6 +340,7 @@ def test_every_task_and_controller_takes_the_options(task, controller):
         assert set(start.metrics) == set(env.metrics) >= {"obstacle_level"}
 
 
+@pytest.mark.slow
 def test_a_policy_that_sees_is_trained_loaded_and_run_in_other_worlds(tmp_path):
     """Trained among 0 to 4 moving spheres; evaluated among none and among six."""
     run = {"episode_length": 3, "run_dir": str(tmp_path / "run")}
