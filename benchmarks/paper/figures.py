@@ -233,6 +233,8 @@ def storyboard(place: Store, path: Path, task: str) -> bool:
 
 def failures(place: Store, path: Path, events: pl.DataFrame) -> bool:
     """The ends of the best seeds' first failed episodes, ours."""
+    if measures.of(events, variant=targets.OURS).is_empty():
+        return False
     images = []
     for task, title in TASKS.items():
         cell = best_cell(place, task, targets.OURS)
