@@ -21,12 +21,13 @@ from . import cli, registry
 from .base import ArmEnv
 from .eval import agent_of
 from .options import Options
+from .safety import ENDING
 from .spheres import AWAY
 from .types import State
 
 BY_HAND = 3
 """Spheres that users can drop into a task, besides its own."""
-EVENTS = ("success", "collision", "self_collision", "joint_limit")
+EVENTS = ("success", *ENDING)
 """What is counted."""
 
 

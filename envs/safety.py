@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -85,6 +87,9 @@ ROUNDING = 1e-3
 
 LIMIT_MARGIN = 0.1
 """A joint nearer than this to a limit is a joint-limit event [rad] (VICES)."""
+
+ENDING = ("collision", "self_collision", "joint_limit")
+"""Fields of `SafetyRecord`: events that end an episode."""
 
 TURN = 2 * jnp.pi
 """robosuite's limit for the continuous joints [rad]."""
@@ -223,7 +228,7 @@ class SafetyRecord(Pytree):
     @property
     def event(self) -> Bool[Array, ""]:
         """Whether anything happened that ends an episode."""
-        return self.collision | self.self_collision | self.joint_limit
+        return functools.reduce(operator.or_, (getattr(self, n) for n in ENDING))
 
     @property
     def events(self) -> dict[str, Bool[Array, ""]]:

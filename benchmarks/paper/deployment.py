@@ -20,6 +20,7 @@ from benchmarks.paper import cells, store
 from benchmarks.paper.cells import COLUMNS, PICTURED, TABLE, Cell, Column, Preset
 from benchmarks.paper.store import Store
 from envs.base import ArmEnv
+from envs.safety import ENDING
 from rmp_mjx import runtime
 from rmp_mjx.metric import reductions
 from rmp_mjx.sim.base import pair_sensors
@@ -181,8 +182,6 @@ SCHEMA = {
 part was the hand, the distance at the end of the policy step [m, rad], and the greatest
 normal force [N]."""
 
-KINDS = ("collision", "self_collision", "joint_limit")
-"""Events that end an episode."""
 REACH = 1.0
 """Distances are looked for up to this [m]."""
 
@@ -206,7 +205,7 @@ def describe(env: ArmEnv, results: Episodes, tape: Recording) -> list[dict[str, 
     for k, length in enumerate(tape.lengths):
         if results["length"][k] > MAX_STEPS:
             continue
-        for kind in KINDS:
+        for kind in ENDING:
             if results[kind][k] > 0:
                 state = tape.state(k, int(length))
                 row = {"episode": k, "step": int(length), "kind": kind}

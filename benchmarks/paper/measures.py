@@ -11,6 +11,7 @@ import polars as pl
 from jaxtyping import Float
 from scipy import stats as scipy_stats
 
+from envs.safety import ENDING
 from rmp_mjx.training.stats import (
     Interval,
     bootstrap_mean,
@@ -199,21 +200,17 @@ def rate(rows: pl.DataFrame, name: str) -> Rate:
     return Rate(int((rows[name] > 0.5).sum()), len(rows))
 
 
-EVENTS = ("collision", "self_collision", "joint_limit")
-"""What ends an episode."""
-
-
 def ended(rows: pl.DataFrame) -> Rate:
     """Episodes that any event ended."""
     return Rate(
-        int(rows.select(pl.any_horizontal(pl.col(EVENTS) > 0.5)).sum().item()),
+        int(rows.select(pl.any_horizontal(pl.col(ENDING) > 0.5)).sum().item()),
         len(rows),
     )
 
 
 def events(rows: pl.DataFrame) -> float:
     """Events in some trainings, whose iterations all have the same number of steps."""
-    each = [f"per_1000_steps/{name}" for name in EVENTS]
+    each = [f"per_1000_steps/{name}" for name in ENDING]
     seeds, last = rows["seed"].n_unique(), float(rows["steps"].max())  # pyright: ignore
     return seeds * last / 1000.0 * sum(float(rows[name].mean()) for name in each)  # pyright: ignore
 

@@ -11,6 +11,7 @@ from benchmarks.paper import measures, store, targets
 from benchmarks.paper.cells import COLUMNS, PAPER, TASKS, VARIANTS
 from benchmarks.paper.page import Table
 from benchmarks.paper.store import Store
+from envs.safety import ENDING
 from rmp_mjx.training.stats import Interval
 
 MISSING = "-"
@@ -101,7 +102,7 @@ def totals(place: Store) -> Table:
             if rows.is_empty():
                 continue
             cells = [title, style.label, str(len(measures.seeds(rows)))]
-            for name in ("collision", "self_collision", "joint_limit"):
+            for name in ENDING:
                 cells.append(number(float(_mean(rows, f"per_1000_steps/{name}"))))
             speed = rows["time/steps_per_s"].median()
             cells.append(number(float(speed)))  # pyright: ignore[reportArgumentType]

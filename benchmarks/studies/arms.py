@@ -20,8 +20,8 @@ import numpy as np
 import envs
 from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
 from benchmarks.studies import random_policies
-from benchmarks.studies.safety_study import ENDING
 from envs.arms import JACO
+from envs.safety import ENDING
 from rmp_mjx import runtime
 from rmp_mjx.training.evaluation.evaluate import recorder
 from rmp_mjx.training.policy import Policy, load_policy

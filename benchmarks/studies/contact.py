@@ -21,9 +21,10 @@ import envs
 from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
 from benchmarks.studies.failures import share
 from benchmarks.studies.random_policies import Clipped
-from benchmarks.studies.safety_study import ENDING, Group, Study
+from benchmarks.studies.safety_study import Group, Study
 from envs.arms import JACO
 from envs.cli import load_config
+from envs.safety import ENDING
 from rmp_mjx import RMPVICES, runtime
 from rmp_mjx.training.policy import load_policy
 

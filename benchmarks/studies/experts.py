@@ -22,13 +22,12 @@ from benchmarks.common import Row, show, write_json
 from envs import door
 from envs.arms import JACO
 from envs.base import ArmEnv
+from envs.safety import ENDING
 from envs.types import State
 from rmp_mjx import runtime
 from rmp_mjx.control.action import ActionRange
 from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.math import orientation_error
-
-EVENTS = ("collision", "self_collision", "joint_limit")
 
 DEFAULT = ("rmp_vices", "vices", "rmp_vices_literal")
 """Controllers that are compared by default."""
@@ -190,7 +189,7 @@ def play(
 def ends(metrics: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Steps of the first success and the first event; the number of steps if none."""
     solved = metrics["success"] > 0
-    event = np.any([metrics[e] > 0 for e in EVENTS], axis=0)
+    event = np.any([metrics[e] > 0 for e in ENDING], axis=0)
     return _first(solved), _first(event)
 
 
@@ -212,7 +211,7 @@ def summarise(name: str, dt: float, metrics: dict[str, np.ndarray]) -> list[Row]
     alive = np.arange(steps)[:, None] <= np.minimum(first, ended)
     in_touch = alive & (metrics["work_force"] > 0)
     force = metrics["work_force"][in_touch]
-    count = {e: int((metrics[e].astype(bool) & alive).any(0).sum()) for e in EVENTS}
+    count = {e: int((metrics[e].astype(bool) & alive).any(0).sum()) for e in ENDING}
     rows = [
         Row(
             f"{name}/success",

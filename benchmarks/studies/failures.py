@@ -18,9 +18,10 @@ import envs
 from benchmarks.common import Row, markdown
 from benchmarks.studies import experts
 from benchmarks.studies.policies import POLICIES, stiffness
-from benchmarks.studies.safety_study import ENDING, World, advance
+from benchmarks.studies.safety_study import World, advance
 from envs import spheres
 from envs.base import ArmEnv
+from envs.safety import ENDING
 from rmp_mjx.training.stats import clopper_pearson
 
 CONTROLLERS = {"rmp_vices": "RMP-VICES", "vices": "VICES"}

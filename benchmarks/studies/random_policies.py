@@ -19,9 +19,10 @@ from scipy import stats
 import envs
 import rmp_mjx as rmp
 from benchmarks.common import Row, insert, markdown, show, write_json
-from benchmarks.studies.safety_study import ENDING, EVENTS, Group, Study
+from benchmarks.studies.safety_study import EVENTS, Group, Study
 from envs.arms import JACO
 from envs.placement import LAYOUTS
+from envs.safety import ENDING
 from rmp_mjx import runtime
 from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.rmp import RMP, ScalarLeaf, resolve

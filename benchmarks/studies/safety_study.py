@@ -33,9 +33,6 @@ EVENTS = (
 )
 """Events that are reported."""
 
-ENDING = ("collision", "self_collision", "joint_limit")
-"""Events that end an episode."""
-
 SPHERES, RADIUS = 2, 0.05
 
 PARTS = (

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.studies.random_policies import NEAR, REACHING_LIMIT, poisson
-from benchmarks.studies.safety_study import ENDING, Group, Study
+from benchmarks.studies.safety_study import Group, Study
 from envs.arms import JACO
+from envs.safety import ENDING
 
 CONTROLLERS = {"rmp_vices": "RMP-VICES", "vices": "VICES"}
 """Controllers and their names in the tables."""

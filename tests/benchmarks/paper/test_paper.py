@@ -32,6 +32,7 @@ from benchmarks.paper import (
 from benchmarks.paper.cells import PRESETS, TASKS, Cell
 from benchmarks.paper.store import Store
 from envs.cli import make_config
+from envs.safety import ENDING
 from envs.types import METRICS
 from rmp_mjx.pytree import Pytree
 from rmp_mjx.training.config import ConfigError
@@ -354,7 +355,7 @@ def test_the_count_of_targets_is_that_of_the_tables_rows(page):
 
 def test_the_claim_counts_the_events_of_training(grid, page):
     rows = grid[0].training.with_columns(
-        hits=pl.sum_horizontal(f"per_1000_steps/{name}" for name in measures.EVENTS)
+        hits=pl.sum_horizontal(f"per_1000_steps/{name}" for name in ENDING)
     )
     steps = rows["steps"].min()  # of an iteration
     events = {

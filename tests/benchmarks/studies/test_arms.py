@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.common import Row
 from benchmarks.studies import arms
-from benchmarks.studies.safety_study import ENDING
+from envs.safety import ENDING
 
 
 def results(**counts):
