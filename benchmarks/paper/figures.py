@@ -189,14 +189,27 @@ def best_cell(place: Store, task: str, variant: str) -> Cell | None:
     return None if rows.is_empty() else Cell(task, variant, measures.best_seed(rows))
 
 
+def best_events(place: Store) -> pl.DataFrame:
+    """Recorded events of the best seeds."""
+    if place.events.is_empty():
+        return place.events
+    chosen = [
+        measures.of(place.events, task=task, variant=variant, seed=cell.seed)
+        for task in TASKS
+        for variant in VARIANTS
+        if (cell := best_cell(place, task, variant))
+    ]
+    return pl.concat(chosen)
+
+
 def montage(images: Sequence[tuple[str, Path]], path: Path, columns: int) -> bool:
     """Pictures with their titles in a grid; True where there is one.
 
-    A packed store has no pictures: then a figure that was drawn before is kept.
+    A packed store has no pictures: then a figure of some that was drawn before is kept.
     """
     found = [(title, path) for title, path in images if path.exists()]
     if not found:
-        return path.exists()
+        return bool(images) and path.exists()
     sizes = [imread(image) for _, image in found]
     height, width = sizes[0].shape[:2]
     cell = (12.0 / columns, 12.0 / columns * height / width + 0.25)
@@ -233,8 +246,6 @@ def storyboard(place: Store, path: Path, task: str) -> bool:
 
 def failures(place: Store, path: Path, events: pl.DataFrame) -> bool:
     """The ends of the best seeds' first failed episodes, ours."""
-    if measures.of(events, variant=targets.OURS).is_empty():
-        return False
     images = []
     for task, title in TASKS.items():
         cell = best_cell(place, task, targets.OURS)

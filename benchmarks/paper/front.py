@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import polars as pl
 
 from benchmarks.paper import deployment, figures, measures, store, tables, targets
 from benchmarks.paper.cells import COLUMNS, PAPER, PICTURED, TASKS, VARIANTS, Preset
-from benchmarks.paper.page import Block, Heading, Picture, Table, Text
+from benchmarks.paper.page import FIGURES, Block, Heading, Picture, Table, Text
 from benchmarks.paper.store import Store
+from benchmarks.paper.targets import Target
 
 TITLE = "The paper's experiments, measured"
 FIGURE = "pareto.png"
@@ -19,7 +20,11 @@ HEADLINE = (*PAPER, "vices_cbf")
 
 
 def blocks(
-    place: Store, preset: Preset, folder: Path, figure_folder: str
+    place: Store,
+    preset: Preset,
+    folder: Path,
+    found: Sequence[Target],
+    events: pl.DataFrame,
 ) -> list[Block]:
     """The first screen.
 
@@ -27,20 +32,21 @@ def blocks(
         place: What was measured.
         preset: The experiment.
         folder: The page's folder.
-        figure_folder: The figures' folder in it.
+        found: Every target.
+        events: Recorded events of the best seeds.
     """
-    figures.pareto(place, folder / figure_folder / FIGURE)
+    figures.pareto(place, folder / FIGURES / FIGURE)
     return [
         Heading(TITLE, 1),
         Text(claim(place)),
         Picture(
-            Path(figure_folder, FIGURE),
+            Path(FIGURES, FIGURE),
             "Success against episodes ended by an event, best seeds, with 95 % "
             "intervals. Up and right is better.",
         ),
         headline(place, PICTURED),
         Text(_made_from(place, preset)),
-        *_not_well(place),
+        *_not_well(place, found, events),
     ]
 
 
@@ -132,9 +138,10 @@ def _made_from(place: Store, preset: Preset) -> str:
     return text
 
 
-def _not_well(place: Store) -> list[Block]:
+def _not_well(
+    place: Store, found: Sequence[Target], events: pl.DataFrame
+) -> list[Block]:
     """What is not met, does not reproduce, or still fails."""
-    found = targets.targets(place)
     open_ones = tables.of_targets([each for each in found if not each.met])
     reproduced = tables.reproduction(place, PICTURED)
     other = [row[:-1] for row in reproduced.rows if row[-1] != "yes"]
@@ -144,7 +151,7 @@ def _not_well(place: Store) -> list[Block]:
     if other:
         blocks.append(Text("What the paper found and this page does not:"))
         blocks.append(Table(reproduced.header[:-1], other))
-    own = measures.of(best_events(place), variant=targets.OURS)
+    own = measures.of(events, variant=targets.OURS)
     number = f"{len(own)} {'event' if len(own) == 1 else 'events'}"
     blocks.append(
         Text(
@@ -157,7 +164,7 @@ def _not_well(place: Store) -> list[Block]:
     return blocks
 
 
-def verdicts(found: list[targets.Target]) -> str:
+def verdicts(found: Sequence[Target]) -> str:
     """How many targets are met, in one sentence."""
     words = [target.verdict for target in found]
     met, failed, undecided = map(words.count, ("met", "NOT MET", "undecided"))
@@ -165,16 +172,3 @@ def verdicts(found: list[targets.Target]) -> str:
         f"Of {len(found)} targets {met} are met, {failed} are not, and {undecided} "
         "are undecided."
     )
-
-
-def best_events(place: Store) -> pl.DataFrame:
-    """Recorded events of the best seeds."""
-    if place.events.is_empty():
-        return place.events
-    chosen = [
-        measures.of(place.events, task=task, variant=variant, seed=cell.seed)
-        for task in TASKS
-        for variant in VARIANTS
-        if (cell := figures.best_cell(place, task, variant))
-    ]
-    return pl.concat(chosen)

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+FIGURES = "figures"
+"""The folder of the figures beside a page."""
+
 
 @dataclass(frozen=True)
 class Heading:

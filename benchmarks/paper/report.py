@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import polars as pl
 
 from benchmarks.paper import cells, figures, front, measures, store, tables, targets
 from benchmarks.paper.cells import (
@@ -14,11 +17,19 @@ from benchmarks.paper.cells import (
     VARIANTS,
     Preset,
 )
-from benchmarks.paper.page import Block, Code, Heading, Picture, Table, Text, markdown
+from benchmarks.paper.page import (
+    FIGURES,
+    Block,
+    Code,
+    Heading,
+    Picture,
+    Table,
+    Text,
+    markdown,
+)
 from benchmarks.paper.store import Store
+from benchmarks.paper.targets import Target
 from rmp_mjx.files import write_text
-
-FIGURES = "figures"
 
 
 def write(place: Store, preset: Preset, folder: Path) -> Path:
@@ -38,14 +49,15 @@ def write(place: Store, preset: Preset, folder: Path) -> Path:
     if place.training.is_empty():
         raise ValueError(f"{place.folder} holds no finished training yet")
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
+    found, events = targets.targets(place), figures.best_events(place)
     blocks = [
-        *front.blocks(place, preset, folder, FIGURES),
-        *_targets(place),
+        *front.blocks(place, preset, folder, found, events),
+        *_targets(found),
         *_reproduction(place),
         *_training(place, folder),
         *_deployment(place, folder),
         *_beyond(place, preset, folder),
-        *_failures(place, folder),
+        *_failures(place, folder, events),
         *_pictures(place, folder),
         *_protocol(place, preset),
     ]
@@ -54,8 +66,7 @@ def write(place: Store, preset: Preset, folder: Path) -> Path:
     return written
 
 
-def _targets(place: Store) -> list[Block]:
-    found = targets.targets(place)
+def _targets(found: Sequence[Target]) -> list[Block]:
     return [
         Heading("Every target"),
         Text(
@@ -175,8 +186,7 @@ def _beyond(place: Store, preset: Preset, folder: Path) -> list[Block]:
     ]
 
 
-def _failures(place: Store, folder: Path) -> list[Block]:
-    events = front.best_events(place)
+def _failures(place: Store, folder: Path, events: pl.DataFrame) -> list[Block]:
     ours = measures.of(events, variant=targets.OURS)
     blocks: list[Block] = [
         Heading("What events were"),

@@ -28,6 +28,8 @@ from rmp_mjx import runtime
 
 TURN = 8
 """Iterations of a turn; its first is not timed."""
+START = 20.0
+"""Processor time after which the page has imported and compiled all it needs [s]."""
 TASK = "trajectory"
 """The task: that of `bench_training`'s iterations."""
 PORT = 8791
@@ -62,15 +64,14 @@ def playing(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     train = [sys.executable, "train.py", "--env", TASK, "--run_dir", str(run)]
     small = ["--num_timesteps", "20000", "--eval_episodes", "0", "--no-video"]
     module = [sys.executable, "-m", "benchmarks.watch_cost", "--page", str(run)]
-    log = (folder / "log").open("wb")
-    subprocess.run([*train, *small], cwd=ROOT, check=True, stdout=log)
-    page = subprocess.Popen(module, cwd=ROOT, stdout=log)
-    try:
-        yield page
-    finally:
-        page.kill()
-        page.wait()
-        log.close()
+    with (folder / "log").open("wb") as log:
+        subprocess.run([*train, *small], cwd=ROOT, check=True, stdout=log)
+        page = subprocess.Popen(module, cwd=ROOT, stdout=log)
+        try:
+            yield page
+        finally:
+            page.kill()
+            page.wait()
 
 
 def processor_time(page: subprocess.Popen[bytes]) -> float:
@@ -80,28 +81,34 @@ def processor_time(page: subprocess.Popen[bytes]) -> float:
 
 
 def measure(page: subprocess.Popen[bytes], turns: int, seed: int) -> list[Row]:
-    """Time iterations, the page playing or stopped in turns."""
+    """Time iterations, the page playing or stopped in turns.
+
+    Raises:
+        RuntimeError: The page ended before it played.
+    """
     times = iterations(make_config(seed=seed))
     list(itertools.islice(times, WARM_UP))
-    while processor_time(page) < 20.0:  # imports and compiling
+    while processor_time(page) < START:
+        if page.poll() is not None:
+            raise RuntimeError(f"the page ended with exit code {page.returncode}")
         next(times)
     found: dict[bool, list[float]] = {True: [], False: []}
-    spent = began = 0.0
+    spent = played = 0.0
     for turn in range(2 * turns):
         plays = turn % 2 == 0
         page.send_signal(signal.SIGCONT if plays else signal.SIGSTOP)
-        before, began = processor_time(page), began - time.perf_counter() * plays
+        before, began = processor_time(page), time.perf_counter()
         timed = list(itertools.islice(times, TURN))[1:]
         found[plays] += [gather + learn for gather, learn in timed]
         spent += processor_time(page) - before
-        began += time.perf_counter() * plays
+        played += (time.perf_counter() - began) * plays
     with_page, without = (np.array(found[plays]) for plays in (True, False))
     note = f"{len(with_page)} iterations of {np.median(without):.3f} s each"
-    share = f"of one core, {began:.0f} s in which it played"
+    share = f"of one core, {played:.0f} s in which it played"
     return [
         Row("cost_of_watching_median", _cost(np.median, with_page, without), "%", note),
         Row("cost_of_watching_mean", _cost(np.mean, with_page, without), "%", note),
-        Row("page_processor_share", 100.0 * spent / began, "%", share),
+        Row("page_processor_share", 100.0 * spent / played, "%", share),
     ]
 
 
