@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rmp_mjx import runtime
 from rmp_mjx.training.runs import policies, run_folder
@@ -91,6 +92,10 @@ class EpisodePage(TaskPage):
         episode.restore(episode.moments[0])
         self.player.simulation, self.player.paused = episode, False
         self.clock.to_now()
+
+    def intent(self, frame: Moment) -> Any:
+        """The action that was taken at a moment, (m,)."""
+        return frame.state.info["action"]
 
     def _choose(self) -> None:
         self.open(worst.load(self._labels[self.which.value], self.env))

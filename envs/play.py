@@ -5,12 +5,12 @@ from __future__ import annotations
 import collections
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.tree_util import Partial
 from rich.console import Console
 
@@ -72,7 +72,8 @@ class Play:
         self.env, self.by_hand = env, by_hand
         self._key = jax.random.key(seed)
         self._reset = jax.jit(env.reset)
-        self._step = jax.jit(partial(_step, env))
+        self._go = jax.jit(env.step)
+        self._act = jax.jit(_act)
         self.agent = agent
         self.history: collections.deque[Moment] = collections.deque(maxlen=kept(env.dt))
         self.now = self._started(1, 0)
@@ -135,9 +136,14 @@ class Play:
         state = state.replace(data=data, info=state.info | {"spheres": spheres})
         self.now = self.now._replace(state=state)
 
-    def advance(self, state: State, key: Any) -> State:
-        """Where one action of the agent leads."""
-        return self._step(self._agent, state, key)
+    def intent(self, frame: Moment) -> Array:
+        """The action that is taken at a moment, (m,)."""
+        key = jax.random.fold_in(self._key, frame.steps + 1)
+        return self._act(self._agent, frame.state.obs, key)
+
+    def advance(self, action: Array) -> State:
+        """Where an action leads from now."""
+        return self._go(self.now.state, action)
 
     def step(self) -> Moment:
         """One policy step; an episode that has ended makes room for the next."""
@@ -145,14 +151,13 @@ class Play:
         over = int(before.info["step"]) >= self.env.episode_length
         if over or float(before.done):
             self.begin()
-        key = jax.random.fold_in(self._key, self.now.steps + 1)
-        self.now = self.now.then(self.advance(self.now.state, key))
+        self.now = self.now.then(self.advance(self.intent(self.now)))
         self.history.append(self.now)
         return self.now
 
 
-def _step(env: ArmEnv, agent: Partial, state: State, key: Any) -> State:
-    return env.step(state, agent(state.obs[None], key)[0])
+def _act(agent: Partial, obs: Array, key: Any) -> Array:
+    return agent(obs[None], key)[0]
 
 
 def load(args: Sequence[str]) -> tuple[Play, str]:

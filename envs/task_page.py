@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,23 @@ import numpy as np
 
 from rmp_mjx.viewer import film
 from rmp_mjx.viewer.clock_panel import ClockPanel
-from rmp_mjx.viewer.drawing import Bodies, mesh_parts
+from rmp_mjx.viewer.drawing import Bodies, Thoughts, mesh_parts
+from rmp_mjx.viewer.insight import on_host
 from rmp_mjx.viewer.loop import Loop
 from rmp_mjx.viewer.player import Simulation
+from rmp_mjx.viewer.tree_panel import TreePanel
 
 from .base import ArmEnv
 from .play import Moment
 from .render import render
+from .scene import ARM
+from .thoughts import thinker
 from .types import State
+
+ROOT = "/task"
+"""The node above the task's bodies."""
+LAST = 1e9
+"""Place in the panel: below all else."""
 
 
 class TaskPage(Loop[Moment]):
@@ -46,13 +56,24 @@ class TaskPage(Loop[Moment]):
         model = env.scene.model
         self._data = mujoco.MjData(model)
         parts = mesh_parts(model, range(model.ngeom))
-        self._bodies = Bodies(self.server.scene, model, "/task", parts)
+        self._bodies = Bodies(self.server.scene, model, ROOT, parts)
         self._marks: dict[tuple, Any] = {}
         eye, middle = _camera(env)
         self.server.initial_camera.position = eye
         self.server.initial_camera.look_at = middle
         self.status = self.server.gui.add_markdown("compiling ...")
         self.clock = ClockPanel(self)
+        self._think = thinker(env)
+        if self._think is not None:
+            gui, title = self.server.gui, "What the tree thinks"
+            with gui.add_folder(title, order=LAST, expand_by_default=False):
+                scene, robot = self.server.scene, env.robot
+                thoughts = Thoughts(scene, robot, model, ROOT, ARM)
+                self.tree = TreePanel(self, thoughts, on=False)
+
+    @abc.abstractmethod
+    def intent(self, frame: Moment) -> Any:
+        """The action that is taken at a moment, (m,)."""
 
     def refuse(self, error: ValueError) -> None:
         """Say why an order is not obeyed."""
@@ -68,6 +89,7 @@ class TaskPage(Loop[Moment]):
         with self.server.atomic():
             self._bodies.move(self._data)
             self._draw_marks(state)
+            self._draw_thoughts(frame)
         events = ", ".join(f"{k} {v}" for k, v in frame.events.items()) or "none"
         self.status.content = (
             f"episode {frame.episode}, step {int(state.info['step'])} of "
@@ -79,6 +101,16 @@ class TaskPage(Loop[Moment]):
     def render(self, frames: Sequence[Moment]) -> list[np.ndarray]:
         """Moments drawn by MuJoCo, with the task's marks."""
         return render(self.env, [frame.state for frame in frames], film.SIZE, False)
+
+    def _draw_thoughts(self, frame: Moment) -> None:
+        """What the tree thinks, if anybody wants to see it: it takes time."""
+        if self._think is None:
+            return
+        if not self.tree.thoughts.wanted:
+            self.tree.hide()
+            return
+        insight = on_host(self._think(frame.state, self.intent(frame)))
+        self.tree.show(insight, self.env.options.controller)
 
     def _draw_marks(self, state: State) -> None:
         shown = {}

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import html
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from .play import Moment
+from .scene import ASSETS
 from .task_page import TaskPage
 from .teleoperation import KP, Teleoperation, Wish, load
 
-NUDGE = 0.02
-"""Distance that the target moves with every stroke of a key [m]."""
-KEYS: dict[Any, tuple[int, float]] = {
-    "I": (0, NUDGE),
-    "K": (0, -NUDGE),
-    "J": (1, NUDGE),
-    "L": (1, -NUDGE),
-    "U": (2, NUDGE),
-    "O": (2, -NUDGE),
+NUDGE, TURN, STIFFER = 0.02, 0.1, 1.25
+"""A stroke of a key moves the target so far [m], with Shift it turns it [rad]; the
+factor of the stiffness."""
+KEYS: dict[Any, tuple[int, int]] = {
+    "I": (0, 1),
+    "K": (0, -1),
+    "J": (1, 1),
+    "L": (1, -1),
+    "U": (2, 1),
+    "O": (2, -1),
 }
-"""Keys, each with an axis of the world and a step; the camera has W, A, S, D, Q, E."""
+"""Keys, each with an axis of the world and a way; the camera has W, A, S, D, Q, E."""
+GAMEPAD = (ASSETS / "gamepad.js").read_text()
+"""Makes a gamepad's sticks and buttons strokes of the page's keys, in the browser."""
 
 
 class DrivePage(TaskPage):
@@ -49,17 +56,50 @@ class DrivePage(TaskPage):
         keep.on_click(lambda _: self.order(driven.keep))
         discard.on_click(lambda _: self.order(driven.discard))
         again.on_click(lambda _: self.order(driven.discard))
+        self._key("R", "Record a demonstration", driven.record)
+        self._key("T", "Keep it", driven.keep)
+        self._key("X", "Discard it", driven.discard)
+        self._key("N", "New episode", driven.discard)
+        self._key("P", "Stiffer", partial(self.stiffen, STIFFER))
+        self._key("M", "Softer", partial(self.stiffen, 1.0 / STIFFER))
         for key, (axis, way) in KEYS.items():
-            label = f"Target {'-+'[way > 0]}{'xyz'[axis]}"
-            command = gui.add_command(label, hotkey=key)
-            command.on_trigger(
-                lambda _, axis=axis, way=way: self.order(lambda: self.nudge(axis, way))
-            )
+            along = f"{'-+'[way > 0]}{'xyz'[axis]}"
+            move = partial(self.nudge, axis, way * NUDGE)
+            turn = partial(self.turn, axis, way * TURN)
+            self._key(key, f"Target along {along}", move)
+            self._key(key, f"Target about {along}", turn, "shift")
+        # A browser runs no script of an HTML element, but what handles its events.
+        script = html.escape(f"{{ {GAMEPAD} }}")
+        gui.add_html(f'<img src="data:," hidden onerror="{script}">')
+
+    def _key(
+        self, key: Any, label: str, what: Callable[[], object], modifier: Any = None
+    ) -> None:
+        """Let a key do something."""
+        command = self.server.gui.add_command(label, hotkey=key, modifier=modifier)
+        command.on_trigger(lambda _: self.order(what))
 
     def _aim(self) -> None:
         """What the gizmo and the slider ask for is asked of the hand."""
         place = np.array(self.target.position), np.array(self.target.wxyz)
         self.driven.wish = Wish(*place, float(self.kp.value))
+
+    def turn(self, axis: int, angle: float) -> None:
+        """Turn the target about an axis of the world [rad]."""
+        turn, turned = np.zeros(4), np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turn, np.eye(3)[axis], angle)
+        mujoco.mju_mulQuat(turned, turn, np.array(self.target.wxyz))
+        self.target.wxyz = turned
+        self._aim()
+
+    def stiffen(self, factor: float) -> None:
+        """Multiply the stiffness, within what the action range allows."""
+        self.kp.value = float(np.clip(factor * self.kp.value, self.kp.min, self.kp.max))
+        self._aim()
+
+    def intent(self, frame: Moment) -> Any:
+        """The action that the target asks for at a moment, (m,)."""
+        return self.driven.intent(frame)
 
     def nudge(self, axis: int, way: float) -> None:
         """Move the target along an axis of the world [m]."""

@@ -96,7 +96,6 @@ class Teleoperation(Play):
         """Columns of the demonstrations that were kept."""
         self._rows: dict[int, dict[str, Any]] = {}
         self._span = controller.action_range
-        self._go = jax.jit(env.step)
         self._pose = jax.jit(lambda data: (env.site(data).p, env.site(data).R))
         self._action = jax.jit(partial(action_towards, self._span))
         self.wish = self.here(KP)
@@ -137,13 +136,16 @@ class Teleoperation(Play):
         self._rows = {k: row for k, row in self._rows.items() if k <= last}
         self.recording &= not again
 
-    def advance(self, state: State, key: Any) -> State:
-        """Where the action that the wish asks for leads."""
-        action = self._action(*self._pose(state.data), self.wish)
-        new = self._go(state, action)
+    def intent(self, frame: Moment) -> Array:
+        """The action that the wish asks for at a moment, (m,)."""
+        return self._action(*self._pose(frame.state.data), self.wish)
+
+    def advance(self, action: Array) -> State:
+        """Where an action leads from now; recorded, it is a row."""
+        new = super().advance(action)
         if self.recording:
             self._rows[self.now.steps + 1] = {
-                "observation": np.asarray(state.obs),
+                "observation": np.asarray(self.now.state.obs),
                 "action": np.asarray(action),
                 "reward": np.asarray(new.reward),
                 "done": np.asarray(new.done > 0.5),

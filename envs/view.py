@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
 
-from .play import Play, load
+from .play import Moment, Play, load
 from .task_page import TaskPage
 
 DROPPED = (0.45, 0.0, 0.5)
@@ -37,6 +38,10 @@ class PolicyPage(TaskPage):
         again.on_click(lambda _: self.order(self.play.begin))
         drop.on_click(lambda _: self.order(self.drop))
         clear.on_click(lambda _: self.order(self.clear))
+
+    def intent(self, frame: Moment) -> Any:
+        """The action that the policy takes at a moment, (m,)."""
+        return self.play.intent(frame)
 
     def drop(self) -> None:
         """Put one more sphere into the task.

@@ -177,9 +177,22 @@ class Thoughts:
     """Control points, the gap and the pulls, in the scene."""
 
     def __init__(
-        self, scene: viser.SceneApi, robot: Robot, model: mujoco.MjModel, root: str
+        self,
+        scene: viser.SceneApi,
+        robot: Robot,
+        model: mujoco.MjModel,
+        root: str,
+        prefix: str = "",
     ):
-        """Make the nodes; the control points hang on the bodies below `root`."""
+        """Make the nodes.
+
+        Args:
+            scene: Where they go.
+            robot: The arm.
+            model: The model that it is in.
+            root: The control points hang on the bodies below this node.
+            prefix: Of the arm's names in the model.
+        """
         self._scene = scene
         ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
         radius = 1.04 * np.asarray(robot.points.radius, float)  # outside of the arm
@@ -188,7 +201,7 @@ class Thoughts:
         for name in dict.fromkeys(robot.points.body):
             here = np.flatnonzero(carried == name)
             handle = scene.add_batched_meshes_simple(
-                f"{root}/{model.body(name).id}/points",
+                f"{root}/{model.body(prefix + name).id}/points",
                 np.asarray(ball.vertices),
                 np.asarray(ball.faces),
                 np.tile([1.0, 0.0, 0.0, 0.0], (len(here), 1)),
@@ -208,6 +221,18 @@ class Thoughts:
         )
         self.arrows: viser.ArrowsHandle | None = None
         self.show_points = self.show_gap = self.show_pulls = True
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anything of it is to be drawn."""
+        return self.show_points or self.show_gap or self.show_pulls
+
+    def hide(self) -> None:
+        """Draw nothing."""
+        nodes = [self.gap, self.label, *(handle for _, handle in self._points)]
+        for node in [*nodes, self.arrows]:
+            if node is not None and node.visible:
+                node.visible = False
 
     def show(self, insight: Insight) -> None:
         """Draw what the tree thinks now."""

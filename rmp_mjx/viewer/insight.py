@@ -92,6 +92,7 @@ def think(
     if controller.braking_share is not None:
         share, tau_max = controller.braking_share, jnp.asarray(robot.tau_max)
         leaves = leaves.braking(stop_time(Mq, bias - tau_ext, qd, tau_max, share))
+    leaves = leaves.weighted(setpoint.weights)
     weight, clearance, gap = _nearest(controller, leaves, world, state, obstacles)
     site = site_state(robot, arm)
     heaviest = jnp.argmax(weight)

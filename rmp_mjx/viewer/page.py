@@ -16,9 +16,10 @@ from rmp_mjx.viewer.drive_panel import DrivePanel
 from rmp_mjx.viewer.session import Frame, Session
 from rmp_mjx.viewer.stage import Stage
 from rmp_mjx.viewer.thing_panel import ThingPanel
+from rmp_mjx.viewer.tree_panel import TreePanel
 
 _SLOW = 6
-"""Bars and charts change with every so many pictures."""
+"""Status and charts change with every so many pictures."""
 EYE, MIDDLE = (1.05, -0.95, 0.95), (0.3, 0.05, 0.4)
 """Where the camera is at first, and what it looks at [m]."""
 GHOSTS = ((235, 120, 30), (60, 160, 80), (150, 80, 190))
@@ -72,13 +73,12 @@ class Page(Stage):
                 self._data.qpos[:] = arm.q
                 mujoco.mj_kinematics(self.session.model, self._data)
                 bodies.move(self._data)
-            self.thoughts.show(insight)
+            self.tree.show(insight, frame.controllers[0])
             self.things.show(frame.things)
             if not self._dragging and frame.target is not self._shown_target:
                 self.target.position, self.target.wxyz = frame.target
                 self._shown_target = frame.target
             if self.pictures % _SLOW == 0:
-                self.bars.content = texts.bars(insight, frame.controllers[0])
                 self.drive.say(texts.status(frame, self.player.pace))
             if self.pictures % _SLOW == _SLOW // 2:
                 with self._chart_tab:
@@ -117,7 +117,7 @@ class Page(Stage):
         self._arms: list[drawing.Bodies] = []
         self._fit_arms(1)
         robot, model = self.session.robot, self.session.model
-        self.thoughts = drawing.Thoughts(server.scene, robot, model, "/arm0")
+        thoughts = drawing.Thoughts(server.scene, robot, model, "/arm0")
         position, wxyz = self.session.target
         self.target = server.scene.add_transform_controls(
             "/target", scale=0.18, position=position, wxyz=wxyz, depth_test=False
@@ -136,26 +136,11 @@ class Page(Stage):
         with tabs.add_tab("Things"):
             self.things = ThingPanel(self)
         with tabs.add_tab("Tree"):
-            self._tree_panel()
+            self.tree = TreePanel(self, thoughts)
         with tabs.add_tab("Leaves"):
             self.dials = DialPanel(self)
         self._chart_tab = tabs.add_tab("Charts")
         self.charts = Charts(server.gui, self.session.robot)
-
-    def _tree_panel(self) -> None:
-        gui = self.server.gui
-        for label, name in {
-            "Control points by weight": "show_points",
-            "The gap": "show_gap",
-            "Pulls of the leaves": "show_pulls",
-        }.items():
-            box = gui.add_checkbox(label, True)
-
-            @box.on_update
-            def _(_, box=box, name=name) -> None:
-                self.order(lambda: setattr(self.thoughts, name, box.value))
-
-        self.bars = gui.add_html("")
 
     def _aim(self, place: tuple[np.ndarray, np.ndarray]) -> None:
         self.session.target = place

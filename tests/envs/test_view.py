@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -15,6 +17,7 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from envs import play as playing
 from envs import view, watch
 from envs.cli import make_config
+from envs.thoughts import thinker
 from envs.train import main as train
 from rmp_mjx import runtime
 from rmp_mjx.training.learning.networks import zero_agent
@@ -78,6 +81,55 @@ def test_the_page_draws_the_task_and_takes_orders(play, tmp_path):
             assert picture.shape == (480, 640, 3) and picture.std() > 5.0
     finally:
         page.server.stop()
+
+
+def test_what_the_tree_thinks_is_shown_where_users_want_it(play, tmp_path):
+    page = view.PolicyPage(play, "a task", 8735, tmp_path)
+    try:
+        page.tick(play.env.dt)
+        thoughts = page.tree.thoughts
+        assert not thoughts.wanted and not thoughts.gap.visible
+        assert page.tree.bars.content == "" and thoughts.arrows is None
+        thoughts.show_gap = thoughts.show_pulls = True
+        page.tick(play.env.dt)
+        assert thoughts.gap.visible
+        assert thoughts.arrows is not None and thoughts.arrows.visible
+        assert "collision: asks" in page.tree.bars.content
+        # The gap is the task's clearance, which the environment measures in its way.
+        clearance = float(play.now.state.metrics["clearance"])
+        assert thoughts.label.text == f"{1e3 * clearance:.0f} mm"
+        thoughts.show_gap = thoughts.show_pulls = False
+        page.tick(0.0)
+        assert not thoughts.gap.visible and not thoughts.arrows.visible
+    finally:
+        page.server.stop()
+
+
+def test_the_tree_thinks_of_the_action_that_is_taken(play):
+    play.begin()
+    now = play.step()
+    env, think = play.env, thinker(play.env)
+    q = now.state.data.qpos[: env.robot.n]
+    action = play.intent(now)
+    assert think is not None
+    insight = think(now.state, action)
+    setpoint = env.controller.setpoint(
+        q, env.controller.decode(action), env.dt * now.state.info["step"]
+    )
+    # The branch of position asks for the impedance's acceleration: M^-1 f at the hand.
+    site = env.site(now.state.data)
+    ahead = np.asarray(setpoint.p_des - site.p)
+    pull = np.asarray(insight.pull["position"])
+    wanted = np.asarray(setpoint.kp_pos) * ahead
+    assert pull @ wanted > 0.0
+    assert np.allclose(
+        play.step().state.data.qpos, env.step(now.state, action).data.qpos
+    )
+
+
+def test_a_controller_without_a_pose_as_target_has_no_tree():
+    other: Any = SimpleNamespace(controller=len, robot=SimpleNamespace(n=7))
+    assert thinker(other) is None
 
 
 @pytest.fixture

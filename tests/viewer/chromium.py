@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import imageio.v3
 import numpy as np
 
 PATH = Path("/usr/bin/chromium")
@@ -22,6 +23,8 @@ ARGUMENTS = [
     "--disable-sync",
 ]
 SIZE = {"width": 1000, "height": 600}
+HARMLESS = ("THREE.Clock", "GPU stall", "GL Driver Message")
+"""Warnings of the browser's own libraries."""
 PATIENCE = 120_000
 """Milliseconds: a second tab has taken half a minute on two busy cores."""
 
@@ -84,3 +87,64 @@ def pixels(client, point) -> np.ndarray:
     focal = 0.5 * height / np.tan(0.5 * camera.fov)
     center = np.array([SIZE["width"], height]) / 2
     return center + focal * np.array([right, down]) / ahead
+
+
+class Tab:
+    """A tab of the browser with the page in it."""
+
+    def __init__(self, browser, page, script=""):
+        self.page, self.faults = page, []
+        known = set(page.server.get_clients())
+        self.window = browser.new_page(viewport=SIZE)
+        self.window.set_default_timeout(PATIENCE)
+        self.window.add_init_script(script)
+        self.window.on("console", self._heard)
+        self.closed = 0
+        self.window.on("websocket", lambda socket: socket.on("close", self._closed))
+        self.window.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.window.goto(page.url)
+        drawn(self.window)
+        self.client = self.joined(known)
+
+    def joined(self, known):
+        clients = self.page.server.get_clients
+        wait(lambda: set(clients()) > known or len(clients()) == 1, "a client")
+        return clients()[max(clients())]
+
+    def _closed(self, _):
+        self.closed += 1
+
+    def _heard(self, message):
+        bad = message.type in ("error", "warning")
+        if bad and not any(word in message.text for word in HARMLESS):
+            self.faults.append(message.text)
+
+    def picture(self):
+        """The scene without the panel, as numbers."""
+        shot = self.window.screenshot(
+            clip={"x": 320, "y": 150, "width": 330, "height": 440}
+        )
+        return np.asarray(imageio.v3.imread(shot)[..., :3], float)
+
+    def click(self, name, role="button"):
+        self.window.get_by_role(role, name=name, exact=True).first.click()
+
+    def choose(self, label, option):
+        self.window.get_by_label(label, exact=True).first.click()
+        self.window.get_by_role("option", name=option, exact=True).first.click()
+
+    def drag(self, point, axis, distance):
+        """Drag a gizmo's arrow, whose tip is 15 cm from its middle."""
+        self.window.bring_to_front()
+        start = pixels(self.client, point + 0.155 * axis)
+        end = pixels(self.client, point + (0.155 + distance) * axis)
+        mouse = self.window.mouse
+        mouse.move(*(start - 2))
+        self.window.wait_for_timeout(300)
+        mouse.move(*start)
+        self.window.wait_for_timeout(800)  # software WebGL has few frames a second
+        mouse.down()
+        for share in (0.3, 0.7, 1.0):
+            mouse.move(*(start + share * (end - start)))
+            self.window.wait_for_timeout(250)
+        mouse.up()

@@ -1,6 +1,5 @@
 """The page in a real browser: Debian's Chromium, headless, with software WebGL."""
 
-import imageio.v3
 import numpy as np
 import pytest
 
@@ -9,9 +8,6 @@ from rmp_mjx.viewer.spring import STRONGEST, pull
 from tests.viewer import chromium
 
 needs_chromium = pytest.mark.skipif(bool(chromium.missing()), reason=chromium.missing())
-
-HARMLESS = ("THREE.Clock", "GPU stall", "GL Driver Message")
-"""Warnings of the browser's own libraries."""
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +22,7 @@ def tabs(browser, page):
     opened = []
 
     def opener():
-        opened.append(Tab(browser, page))
+        opened.append(chromium.Tab(browser, page))
         return opened[-1]
 
     yield opener
@@ -51,66 +47,6 @@ def _idle(tab):
     """Let the browser's events arrive."""
     tab.window.wait_for_timeout(50)
     return True
-
-
-class Tab:
-    """A tab of the browser with the page in it."""
-
-    def __init__(self, browser, page):
-        self.page, self.faults = page, []
-        known = set(page.server.get_clients())
-        self.window = browser.new_page(viewport=chromium.SIZE)
-        self.window.set_default_timeout(chromium.PATIENCE)
-        self.window.on("console", self._heard)
-        self.closed = 0
-        self.window.on("websocket", lambda socket: socket.on("close", self._closed))
-        self.window.on("pageerror", lambda error: self.faults.append(str(error)))
-        self.window.goto(page.url)
-        chromium.drawn(self.window)
-        self.client = self.joined(known)
-
-    def joined(self, known):
-        clients = self.page.server.get_clients
-        chromium.wait(lambda: set(clients()) > known or len(clients()) == 1, "a client")
-        return clients()[max(clients())]
-
-    def _closed(self, _):
-        self.closed += 1
-
-    def _heard(self, message):
-        bad = message.type in ("error", "warning")
-        if bad and not any(word in message.text for word in HARMLESS):
-            self.faults.append(message.text)
-
-    def picture(self):
-        """The scene without the panel, as numbers."""
-        shot = self.window.screenshot(
-            clip={"x": 320, "y": 150, "width": 330, "height": 440}
-        )
-        return np.asarray(imageio.v3.imread(shot)[..., :3], float)
-
-    def click(self, name, role="button"):
-        self.window.get_by_role(role, name=name, exact=True).first.click()
-
-    def choose(self, label, option):
-        self.window.get_by_label(label, exact=True).first.click()
-        self.window.get_by_role("option", name=option, exact=True).first.click()
-
-    def drag(self, point, axis, distance):
-        """Drag a gizmo's arrow, whose tip is 15 cm from its middle."""
-        self.window.bring_to_front()
-        start = chromium.pixels(self.client, point + 0.155 * axis)
-        end = chromium.pixels(self.client, point + (0.155 + distance) * axis)
-        mouse = self.window.mouse
-        mouse.move(*(start - 2))
-        self.window.wait_for_timeout(300)
-        mouse.move(*start)
-        self.window.wait_for_timeout(800)  # software WebGL has few frames a second
-        mouse.down()
-        for share in (0.3, 0.7, 1.0):
-            mouse.move(*(start + share * (end - start)))
-            self.window.wait_for_timeout(250)
-        mouse.up()
 
 
 @needs_chromium
