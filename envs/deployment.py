@@ -87,6 +87,7 @@ def export(
         ImportError: onnx is not installed.
     """
     controller = controller_of(env, period)
+    guard = controller.guard
     slots = Obstacles.empty(spheres=spheres, planes=1, **env.fixture_slots)
     observer = None if env.observer is None else env.observer.replace(delay=0)
     programs = control_programs(controller, observer, slots)
@@ -104,6 +105,11 @@ def export(
     metadata = {
         "task": env.name,
         "controller": env.options.controller,
+        "guard": guard
+        and {
+            name: float(getattr(guard, name))
+            for name in ("speed", "obstacle_speed", "obstacle_error")
+        },
         "period": period,
         "policy_period": CTRL_DT,
         "observation": [list(entry) for entry in env.entries],

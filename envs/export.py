@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 from rich.console import Console
 
@@ -47,6 +48,9 @@ class ExportOptions:
     """Time between two calls of the controller on the robot [s]. For NAME.rmp."""
     spheres: int = 4
     """Slots for spheres that the robot is told of. For NAME.rmp."""
+    guard_speed: float | None = None
+    """Put `StopGuard` behind the controller, for obstacles of at most this speed [m/s];
+    default: as the run has it. For NAME.rmp."""
     checkpoint: str = NEWEST
     """Which checkpoint of the run: newest, best (by the success, then the return, of
     training's episodes), or an iteration's number."""
@@ -91,10 +95,12 @@ def export(options: ExportOptions, note: Callable[[str], None]) -> None:
         _check(options)
         if not issubclass(registry.task(task.env), ArmEnv):
             raise ConfigError(f"task '{task.env}' has no arm that a robot could be")
-    elif options.robot:
-        raise ConfigError("a policy alone has no arm: leave robot out")
+    elif options.robot or options.guard_speed is not None:
+        raise ConfigError("a policy alone has no arm: leave robot and guard_speed out")
     if options.robot and options.robot != task.robot:
         task, besides = dataclasses.replace(task, robot=options.robot), (identity.ARM,)
+    if (speed := options.guard_speed) is not None:
+        task = dataclasses.replace(task, guard=True, obstacle_speed=speed)
     env = registry.make(task)
     iterations, agent = policies.load_agent(
         env, config, run, True, note, k, options.checkpoint, besides
@@ -123,6 +129,8 @@ def _check(options: ExportOptions) -> None:
         raise ConfigError(f"period must be in [0.0001, {CTRL_DT}] s")
     if not 0 <= options.spheres <= MOST_SPHERES:
         raise ConfigError(f"spheres must be at most {MOST_SPHERES}, at least 0")
+    if options.guard_speed is not None and not 0.0 <= options.guard_speed < np.inf:
+        raise ConfigError("guard_speed must be finite and at least 0 m/s")
     if importlib.util.find_spec("onnx") is None:
         raise ConfigError("this needs onnx: pip install 'rmp-mjx[deploy]'")
 

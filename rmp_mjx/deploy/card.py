@@ -39,6 +39,10 @@ def card(metadata: Mapping[str, Any], about: Mapping[str, Any]) -> str:
         f"`{robot['fingerprint']}`. {robot['tool']} The base stands at "
         f"{robot['mount']} m in the task's frame.",
         "",
+        "## Guard",
+        "",
+        guarded(metadata),
+        "",
         "## Training",
         "",
         f"{about.get('steps', 'an unknown number of')} steps in simulation with the "
@@ -85,6 +89,18 @@ def _figures(evaluation: Mapping[str, Any] | None) -> list[str]:
                 f"| {100 * low:.1f} to {100 * high:.1f} |"
             )
     return lines
+
+
+def guarded(metadata: Mapping[str, Any]) -> str:
+    """What stands behind the controller, in a sentence."""
+    guard = metadata["guard"]
+    if guard is None:
+        return "None: a contact may find the arm moving."
+    return (
+        f"A torque passes only if the arm can stop after it: whatever touches the arm, "
+        f"itself no faster than {guard['obstacle_speed']:g} m/s, finds it slower than "
+        f"{guard['speed']:g} m/s, under the assumptions of docs/guard.md."
+    )
 
 
 def untested(metadata: Mapping[str, Any], trained: Mapping[str, Any]) -> list[str]:

@@ -122,7 +122,7 @@ def test_a_file_says_what_it_is(deployed):
     card = deployed.card
     assert "| ended in a collision of arm or hand | 0.0 | 0.0 to 3.6 |" in card
     assert "The figures are of the arm 'panda', not of 'fr3'." in card
-    assert "control every 5 ms" in card
+    assert "control every 5 ms" in card and "a contact may find the arm" in card
 
 
 def test_loading_needs_neither_mujoco_nor_flax_nor_brax(exported, root):
