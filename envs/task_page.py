@@ -89,7 +89,7 @@ class TaskPage(Loop[Moment]):
         with self.server.atomic():
             self._bodies.move(self._data)
             self._draw_marks(state)
-            self._draw_thoughts(frame)
+        self._draw_thoughts(frame)
         events = ", ".join(f"{k} {v}" for k, v in frame.events.items()) or "none"
         self.status.content = (
             f"episode {frame.episode}, step {int(state.info['step'])} of "
@@ -109,8 +109,11 @@ class TaskPage(Loop[Moment]):
         if not self.tree.thoughts.wanted:
             self.tree.hide()
             return
+        if not self.tree.bars.content:
+            self.tree.bars.content = "compiling ..."
         insight = on_host(self._think(frame.state, self.intent(frame)))
-        self.tree.show(insight, self.env.options.controller)
+        with self.server.atomic():
+            self.tree.show(insight, self.env.options.controller)
 
     def _draw_marks(self, state: State) -> None:
         shown = {}

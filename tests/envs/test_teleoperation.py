@@ -179,7 +179,7 @@ def test_keys_and_a_gamepad_drive_the_hand_in_a_browser(driven, tmp_path):
         tab.click("Pulls of the leaves", "checkbox")
         shown = page.tree.thoughts
         chromium.wait(lambda: bool(shown.arrows and shown.arrows.visible), "arrows")
-        assert "posture" in page.tree.bars.content
+        chromium.wait(lambda: "posture" in page.tree.bars.content, "bars")
         assert tab.faults == []
     found = demonstrations.read(driven.path)
     # on the way all went to the left: -1 to 1 of the action's y
