@@ -16,7 +16,9 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-_CACHE = "JAX_COMPILATION_CACHE_DIR"
+_CACHE, _FLAGS = "JAX_COMPILATION_CACHE_DIR", "XLA_FLAGS"
+QUICK = "--xla_backend_optimization_level=0"
+"""Programs compile two to four times faster, and a test runs most of them once."""
 CONTROLLER = ("rmp", "robot", "control")
 """Rooms of the controller, of the package and of the tests."""
 CHECKED = [f"rmp_mjx.{name}" for name in (*CONTROLLER, "shapes", "obstacles", "vec")]
@@ -32,6 +34,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if _CACHE not in os.environ:
         os.environ[_CACHE] = tempfile.mkdtemp(prefix="rmp-mjx-test-xla-")
         config.stash[_own_cache] = Path(os.environ[_CACHE])
+
+    flags = os.environ.get(_FLAGS, "")
+    if "optimization_level" not in flags and config.option.markexpr == "not slow":
+        os.environ[_FLAGS] = f"{flags} {QUICK}".strip()
 
     # From here on, what these modules take and return is held to its annotations.
     install_import_hook(CHECKED, "beartype.beartype")
