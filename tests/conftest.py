@@ -74,6 +74,15 @@ def robot():
     return Robot.load()
 
 
+@pytest.fixture(scope="session")
+def bent():
+    """An arm that is nowhere symmetric, with a slide and a base of its own place."""
+    from rmp_mjx import Robot
+    from tests.bent import BENT
+
+    return Robot.from_mjcf(BENT, site="tip", spacing=0.05)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def ranks(request):
     """In the controller's rooms arrays of different ranks do not mix by accident."""

@@ -5,6 +5,10 @@ import numpy as np
 import pytest
 
 from rmp_mjx import Robot
+from rmp_mjx.robot.configurations import capsule_ends
+from rmp_mjx.robot.control_points import hull_corners
+from rmp_mjx.robot.enclose import distance_to_segment
+from tests.bent import BENT
 from tests.robot.test_model import GRIPPER, ODD
 
 
@@ -106,6 +110,60 @@ def test_capsules_enclose_geoms_of_any_shape(text):
             gaps = [np.linalg.norm(corner - x) - radius for x, radius in balls]
             # Between two balls of a row the surface dips by spacing^2 / (8 radius).
             assert min(gaps) < 1e-6 + 0.0135**2 / (8 * robot.capsules.radius[c])
+
+
+@pytest.mark.parametrize("text", [ODD, GRIPPER, BENT], ids=["odd", "gripper", "bent"])
+def test_every_geom_is_inside_its_capsules(text):
+    """Also the fixed base's, in five configurations. 1e-6 m: the arm's text has six
+    digits."""
+    robot = Robot.from_mjcf(text, site="tip")
+    model, rng, seen = robot.mj_model, np.random.default_rng(0), set()
+    data = mujoco.MjData(model)
+    for q in robot.q_ref + rng.uniform(-1, 1, (5, robot.n)):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        ends = capsule_ends(robot, q[None], range(len(robot.capsules.geom)))
+        for g in range(model.ngeom):
+            name = model.geom(g).name
+            own = [c for c, geom in enumerate(robot.capsules.geom) if geom == name]
+            seen |= set(own)
+            gaps = [
+                distance_to_segment(_surface(model, data, g), *(x[0] for x in ends[c]))
+                - robot.capsules.radius[c]
+                for c in own
+            ]
+            assert np.min(gaps, axis=0).max() < 1e-6
+    assert len(seen) == len(robot.capsules.geom)
+
+
+SHAPES = """<mujoco><asset>
+<mesh name="first" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>
+<mesh name="second" vertex=".1 0 0 .5 0 .1 .1 .3 0 0 0 .4 .2 .2 .5"/>
+</asset><worldbody><geom type="box" size=".1 .2 .3"/>
+<geom type="ellipsoid" size=".3 .1 .2"/><geom type="cylinder" size=".2 .4"/>
+<geom type="mesh" mesh="second"/></worldbody></mujoco>"""
+
+
+def test_corners_support_a_geom_from_every_side():
+    """A box and a mesh exactly, a cylinder up to the corners of a polygon of 32 sides;
+    an ellipsoid has the corners of its box. 1e-6: meshes are in float32."""
+    model, rng = mujoco.MjModel.from_xml_string(SHAPES), np.random.default_rng(0)
+    d = rng.normal(size=(500, 3))
+    box, ellipsoid, cylinder, mesh = (hull_corners(model, g) for g in range(4))
+
+    def support(points):
+        return (d @ points.T).max(axis=1)
+
+    sides = np.abs(d)
+    np.testing.assert_allclose(support(box), sides @ [0.1, 0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(support(ellipsoid), sides @ [0.3, 0.1, 0.2], atol=1e-6)
+    radial, axial = 0.2 * np.hypot(*d.T[:2]), 0.4 * sides[:, 2]
+    found = support(cylinder)
+    assert np.all(found > radial + axial - 1e-9)
+    assert np.all(found < radial / np.cos(np.pi / 32) + axial + 1e-9)
+    assert mesh.shape == (5, 3)
+    vertices = model.mesh_vert[model.mesh_vertadr[1] :]  # in the frame of the geom
+    np.testing.assert_array_equal(mesh, vertices)
 
 
 def _surface(model, data, g):

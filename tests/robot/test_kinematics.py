@@ -8,7 +8,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from rmp_mjx.robot.kinematics import point_positions, site_pose
+from rmp_mjx.robot.configurations import joint_frames, random_configurations
+from rmp_mjx.robot.kinematics import (
+    arm_state,
+    base_point,
+    carry_points,
+    point_positions,
+    site_pose,
+)
+from tests import oracles
+from tests.bent import Measured, along
+from tests.control.conftest import QUICK
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +90,40 @@ def test_pose_keeps_the_precision_it_is_called_in(robot):
                 lambda q: site_pose(robot, q), jax.ShapeDtypeStruct((7,), dtype)
             )
         assert p.dtype == R.dtype == dtype
+
+
+def test_an_arm_with_a_slide_and_a_base_of_its_own_moves_as_mujocos(bent, ours):
+    """Site and control points in 50 states; speeds of 3 m/s, 1e-10 of 30 m/s^2."""
+    rng, measured = np.random.default_rng(0), Measured(bent)
+    q, qd = random_configurations(bent, 50), rng.normal(size=(50, 4))
+    terms, twist, (x, v, a) = ours(bent, q, qd)
+    expected = oracles.mujoco_terms(bent.mj_model, "tip", q, qd)
+    for name, found, theirs in zip(terms._fields, terms, expected, strict=True):
+        np.testing.assert_allclose(found, theirs, rtol=0, atol=1e-10, err_msg=name)
+    np.testing.assert_allclose(twist, np.einsum("kij,kj->ki", terms.J, qd), atol=1e-11)
+    points = [measured.points(q_k) for q_k in q]
+    np.testing.assert_allclose(x, points, rtol=0, atol=1e-12)
+    with jax.enable_x64(True):
+        move = jax.jit(jax.vmap(point_positions, (None, 0)), compiler_options=QUICK)
+        alone = move(bent, q)
+        np.testing.assert_allclose(alone, points, rtol=0, atol=1e-12)
+    for k in range(5):  # central differences: 1e-4 of 30 m/s^2
+        rate, curve, _ = along(lambda q, _: measured.points(q).ravel(), q[k], qd[k])
+        np.testing.assert_allclose(v[k].ravel(), rate, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(a[k].ravel(), curve, rtol=0, atol=1e-4)
+
+
+def test_points_of_the_fixed_base_stay_in_the_world(bent):
+    """They are given in the world frame; 1e-12 m: one sum is undone."""
+    offset = np.random.default_rng(0).normal(size=(4, 3))
+    segment = np.array([-1, 3, -1, 0])
+    q = random_configurations(bent, 1)[0]
+    with jax.enable_x64(True):
+        arm = jax.jit(arm_state, compiler_options=QUICK)(bent, q, jnp.zeros(4))
+        x, carrier = carry_points(bent, arm, offset, segment)
+        world = x.stack(1) + base_point(bent)[None]
+    p, R = joint_frames(bent, q[None])
+    for i, k in enumerate(segment):
+        expected = offset[i] if k < 0 else p[k, 0] + R[k, 0] @ offset[i]
+        np.testing.assert_allclose(world[i], expected, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(carrier, np.eye(4)[:, [0, 3, 0, 0]] * (segment >= 0))

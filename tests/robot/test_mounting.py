@@ -63,6 +63,14 @@ def test_the_finger_is_part_of_the_arm(bare, fingered):
     assert any(finger in pair for pair in fingered.capsules.pairs)
 
 
+def test_the_finger_is_seen_and_collides(fingered):
+    """An opaque colour, and the same masks as the Jaco 2's geoms."""
+    geom, jaco = fingered.mj_model.geom("finger"), Robot.load("jaco2").mj_model
+    assert ((geom.rgba >= 0.0) & (geom.rgba <= 1.0)).all() and geom.rgba[3] == 1.0
+    assert geom.contype[0] == jaco.geom("fingers").contype[0]
+    assert geom.conaffinity[0] == jaco.geom("fingers").conaffinity[0]
+
+
 def test_the_base_stands_elsewhere_and_nothing_else_changes(bare):
     moved = Robot.load("ur5e", mount=PLACE)
     np.testing.assert_allclose(moved.offset[0] - bare.offset[0], PLACE, atol=1e-9)
