@@ -308,6 +308,17 @@ def test_a_torque_that_is_no_number_is_not_sent(robot, guard, one_step):
     assert found["guard_used"] == 1.0
 
 
+def test_a_step_went_as_predicted_if_every_joint_did(guard):
+    """Within a tolerance of 1e-4 rad/s, either way."""
+    kept, expected = jax.jit(guard.kept), np.linspace(-1, 1, 7, dtype="f")
+    assert kept(expected, expected)
+    for joint in range(7):
+        for way in (-1.0, 1.0):
+            off = np.float32(way * np.eye(7)[joint])
+            assert kept(expected, expected + 9e-5 * off)
+            assert not kept(expected, expected + 1.1e-4 * off)
+
+
 def test_an_unlimited_slide_has_no_bounds(robot):
     slides = (False, *robot.hinge[1:])
     with pytest.raises(ValueError, match="sliding joint"):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rmp_mjx import Robot, RobotError, RobotWarning
-from rmp_mjx.robot.configurations import capsule_gaps
-from rmp_mjx.robot.posture import manipulability
+from rmp_mjx.robot.configurations import capsule_gaps, random_configurations
+from rmp_mjx.robot.posture import manipulability, search_posture
+from tests.bent import Measured
 
 
 def text(second="-2 2", key="", first=""):
@@ -79,20 +80,72 @@ def test_a_stretched_arm_rests_in_a_better_posture():
     both = np.stack([robot.q_ref, robot.q_home])
     stretched, better = manipulability(robot, both)
     assert stretched < 1e-6 and better > 0.05
-    assert better == pytest.approx(_by_mujoco(robot), rel=1e-6)
+    assert better == pytest.approx(_by_mujoco(robot, robot.q_home), rel=1e-6)
     assert capsule_gaps(robot, both[1:], robot.capsules.pairs).min() > 0.05
 
 
-def _by_mujoco(robot):
-    """The square root of the determinant of J J^T at home."""
+def _by_mujoco(robot, q):
+    """The root of the determinant of J J^T, of J^T J for fewer than six joints."""
     model = robot.mj_model
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.q_home
+    data.qpos[:] = q
     mujoco.mj_forward(model, data)
     J = np.zeros((2, 3, robot.n))
     mujoco.mj_jacSite(model, data, J[0], J[1], model.site(robot.site_name).id)
-    J = J.reshape(6, -1)
-    return np.sqrt(np.linalg.det(J @ J.T))
+    return np.prod(np.linalg.svd(J.reshape(6, -1), compute_uv=False))
+
+
+@pytest.mark.parametrize("name", ["bent", "ur5e", "jaco2"])
+def test_manipulability_is_that_of_mujocos_jacobian(name, bent):
+    """Four, six and seven joints, 20 postures; 1e-6: the root of a determinant."""
+    robot = bent if name == "bent" else Robot.load(name)
+    q = random_configurations(robot, 20)
+    expected = [_by_mujoco(robot, q_k) for q_k in q]
+    np.testing.assert_allclose(manipulability(robot, q), expected, rtol=1e-6, atol=1e-6)
+
+
+def _crowded(robot, share):
+    """The arm with its last joint's reference at this share of half the range."""
+    room = robot.q_ref[3] - robot.q_lower[3]
+    upper = robot.q_upper.copy()
+    upper[3] = robot.q_ref[3] + room * share / (2.0 - share)
+    return robot.replace(q_upper=upper)
+
+
+def test_a_tenth_of_half_the_range_is_room_enough(bent):
+    assert search_posture(_crowded(bent, 0.11), 50)[1] == ""
+    for share in (0.09, -0.1):
+        found = search_posture(_crowded(bent, share), 50)[1]
+        assert found == "is outside or near the end of a joint's range"
+
+
+@pytest.mark.parametrize("samples", [3, 10, 30, 100])
+def test_the_searched_posture_has_the_greatest_product(bent, samples):
+    """Of manipulability, room and distance from itself, by MuJoCo C; 2 pi away from the
+    reference pose a joint counts 1 / e."""
+    robot, measured = _crowded(bent, 0.05), Measured(bent)
+    q = np.vstack([robot.q_ref, random_configurations(robot, samples)])
+    gap = [measured.gaps(x, bent.capsules.pairs).min() for x in q]
+    ends = np.stack([q - robot.q_lower, robot.q_upper - q])[:, :, 1:]
+    room = (2.0 * ends / (robot.q_upper - robot.q_lower)[1:]).min(axis=(0, 2))
+    near = np.exp(-np.square((q - robot.q_ref) / (2 * np.pi)).sum(axis=1))
+    reach = np.array([_by_mujoco(robot, x) for x in q])
+    product = reach * np.maximum(room, 0.0) * np.clip(gap, 0.0, 0.1) * near
+    np.testing.assert_array_equal(
+        search_posture(robot, samples)[0], q[product.argmax()]
+    )
+
+
+def test_an_arm_whose_links_touch_in_the_reference_pose_rests_elsewhere(bent):
+    """Links thicker by half the gap that there is: a millimetre more or less."""
+    pairs = bent.capsules.pairs
+    gap = Measured(bent).gaps(bent.q_ref, pairs).min()
+    for more, expected in ((-1e-3, ""), (1e-3, "is in collision with itself")):
+        radius = bent.capsules.radius + (gap + more) / 2.0
+        thick = bent.replace(capsules=bent.capsules.replace(radius=radius))
+        q, fault = search_posture(thick, 50)
+        assert fault == expected
+        assert np.array_equal(q, bent.q_ref) == (more < 0.0)
 
 
 def test_a_reference_pose_well_within_the_ranges_is_the_posture():

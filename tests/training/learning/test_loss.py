@@ -13,7 +13,13 @@ from scipy import stats
 
 from rmp_mjx.training.learning import value_scale
 from rmp_mjx.training.learning.advantages import generalised_advantages
-from rmp_mjx.training.learning.loss import Batch, ppo_loss
+from rmp_mjx.training.learning.loss import (
+    Batch,
+    explained_variance,
+    ppo_loss,
+    standardized,
+    weighted_mean,
+)
 from rmp_mjx.training.learning.networks import distribution, make_networks
 from rmp_mjx.training.learning.rollout import Transition
 
@@ -203,3 +209,31 @@ def test_rescaling_keeps_every_value():
 
     # 700 is subtracted and added again in float32: 700 * 2^-23 = 8e-5, a few times
     np.testing.assert_allclose(value(moved, new), value(params, old), atol=5e-4)
+
+
+@pytest.mark.parametrize("count", [24, 7, 2])
+def test_statistics_are_numpys_of_the_entries_that_count(count):
+    """Skewed numbers, 1e-4: float32. Those without weight change nothing."""
+    rng = np.random.default_rng(0)
+    x, errors = np.exp(rng.normal(size=(2, 4, 6))).astype("f")
+    weight = rng.permutation(np.arange(24) < count).reshape(4, 6).astype("f")
+    kept, missed = x[weight > 0], errors[weight > 0]
+    x, errors, weight = map(jnp.asarray, (x, errors, weight))
+    found = standardized(x, weight)
+    np.testing.assert_allclose(
+        found, (x - kept.mean()) / kept.std(), rtol=1e-4, atol=1e-4
+    )
+    np.testing.assert_allclose(weighted_mean(x, weight), kept.mean(), rtol=1e-4)
+    share = 1.0 - np.square(missed).mean() / kept.var()
+    np.testing.assert_allclose(
+        explained_variance(x, errors, weight), share, rtol=1e-4, atol=1e-4
+    )
+
+
+def test_the_mean_of_one_entry_is_that_entry_and_of_none_zero():
+    x, none = jnp.arange(3.0) + 5.0, jnp.zeros(3)
+    assert weighted_mean(x, none.at[1].set(1.0)) == 6.0
+    assert weighted_mean(x, none) == 0.0
+    assert np.isfinite(standardized(x, none)).all()
+    np.testing.assert_array_equal(standardized(jnp.full(3, 7.0), none + 1.0), 0.0)
+    assert np.isfinite(explained_variance(x, x, none))
