@@ -82,6 +82,7 @@ def test_control_is_torque_up_to_the_limit(text, limit):
     assert model.na == 0
     np.testing.assert_array_equal(applied(robot, [1.5, -2.5]), [1.5, -2.5])
     np.testing.assert_array_equal(applied(robot, [99, -99]), [5.0, -limit])
+    assert not model.actuator_gear[:, 1:].any()  # of six gears a hinge has one
 
 
 def test_the_joint_may_limit_a_position_actuator():
