@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rmp_mjx import RMPVICES, Obstacles, OrientationRelaxation, Robot, SetpointDither
+from rmp_mjx.control.relaxation import joint_limit_relaxation
 from tests.control.conftest import QUICK, changed
 from tests.robot.test_model import GRIPPER
 
@@ -35,6 +37,17 @@ def test_a_hand_that_moves_is_left_alone():
     moving = dither(0.6, room, jnp.array([3.0 * dither.speed, 0.0, 0.0]))
     still = dither(0.6, room, STILL)
     np.testing.assert_allclose(moving, np.exp(-9.0) * still, rtol=1e-4)
+
+
+def test_the_displacement_is_its_documented_formula():
+    """Default numbers; 1e-6 of 3 cm: float32 phases."""
+    dither, rng = jax.jit(SetpointDither()), np.random.default_rng(0)
+    for time, room in rng.uniform([0.0, 0.0], [3.0, 0.06], (40, 2)):
+        v = rng.normal(scale=0.04, size=3)
+        share = np.clip((0.05 - room) / 0.03, 0.0, 1.0) * np.exp(-(v @ v) / 0.1**2)
+        phase = 2 * np.pi * time / 2.5 * np.array([1.0, 0.618, 0.382])
+        found = dither(time, jnp.float32(room), jnp.asarray(v, jnp.float32))
+        np.testing.assert_allclose(found, 0.03 * share * np.sin(phase), atol=1e-6)
 
 
 def test_at_time_zero_the_set_point_stays_where_it_is(run64, ctrl, states, obstacles):
@@ -94,6 +107,17 @@ def test_weight_falls_from_one_to_its_least_as_the_clearance_shrinks():
     np.testing.assert_allclose(
         jax.vmap(weight)(clearance), [1.0, 1.0, 1.0, 0.1, 0.01, 0.01], rtol=1e-6
     )
+
+
+@pytest.mark.parametrize(
+    ("weight", "near", "far"),
+    [(OrientationRelaxation(), 0.015, 0.07), (joint_limit_relaxation(), 0.2, 1.2)],
+    ids=["obstacle", "joint limit"],
+)
+def test_by_default_a_thousandth_is_left_where_the_room_is_least(weight, near, far):
+    rooms = jnp.asarray([0.9 * near, near, 0.5 * (near + far), far, 1.1 * far])
+    expected = [1e-3, 1e-3, 10**-1.5, 1.0, 1.0]
+    np.testing.assert_allclose(jax.vmap(weight)(rooms), expected, rtol=1e-5)
 
 
 def test_orientation_is_relaxed_beside_bodies_but_not_beside_planes(

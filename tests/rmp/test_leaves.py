@@ -163,50 +163,6 @@ def test_paper_leaf_weighs_and_brakes_an_approach_alone():
     np.testing.assert_allclose(f, [2500.0, 0.0], rtol=1e-5)
 
 
-def test_the_papers_leaf_is_its_formula(x64):
-    """Squared speed of approach over the fourth power of the distance to the margin,
-    from which it is clamped; at most the cap. 1e-12: float64."""
-    leaf = leaves.PaperCollision(eta=3.0, margin=0.05, x_min=0.02, cap=40.0)
-    x, xd = (v.ravel() for v in np.meshgrid(np.linspace(-0.1, 2, 43), [-1, -0.1, 0, 1]))
-    f, m = leaf.scalar(jnp.asarray(x), jnp.asarray(xd))
-    approach, gap = np.maximum(-xd, 0.0), np.maximum(x - 0.05, 0.02)
-    expected = np.minimum(approach**2 / gap**4, 40.0)
-    np.testing.assert_allclose(m, expected, rtol=1e-12)
-    np.testing.assert_allclose(f, -3.0 * expected * xd, rtol=1e-12)
-    assert (expected == 40.0).any() and ((expected > 0) & (expected < 1)).any()
-
-
-STANDING_OFF = {
-    "paper": leaves.PaperCollision(margin=0.02),
-    "near": leaves.collision_near(),
-}
-
-
-@pytest.mark.parametrize("name", STANDING_OFF)
-def test_standing_off_is_the_same_leaf_farther_out(name, x64):
-    """To 1e-9, relative: differences of distances."""
-    leaf = STANDING_OFF[name]
-    x, xd = (
-        v.ravel() for v in np.meshgrid(np.linspace(-0.1, 0.4, 41), [-1.0, 0.0, 1e-3])
-    )
-    near = leaf.scalar(jnp.asarray(x), jnp.asarray(xd))
-    far = leaf.standing_off(0.03).scalar(jnp.asarray(x + 0.03), jnp.asarray(xd))
-    for a, b in zip(near, far, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9)
-
-
-def test_a_barrier_of_a_slow_arm_counts_the_gap_that_its_stop_leaves(x64):
-    """Approached at 0.4 m/s with 0.5 s to stop the gap is 0.1 m less, but neither the
-    rate nor the depth in the margin is another; a leaving body needs no stop."""
-    leaf = leaves.Barrier(mu=0.01, r=1.0, margin=0.05, cap=1e9)
-    x, xd = jnp.linspace(0.2, 0.9, 8), jnp.full(8, -0.4)
-    f, m = leaf.braking(0.5).scalar(x, xd)
-    near = leaf.scalar(x - 0.1, xd)
-    np.testing.assert_allclose(m, near[1], rtol=1e-12)
-    np.testing.assert_allclose(f, near[0], rtol=1e-12)
-    np.testing.assert_array_equal(leaf.braking(0.5).scalar(x, -xd), leaf.scalar(x, -xd))
-
-
 def test_bare_geodesic_leaf_obeys_xdd_equals_xd_squared_over_x():
     x, xd = _grid([0.05, 0.1, 0.7], [-2.0, -0.3, -0.05])
     f, m = GeodesicBarrier(eta=0.0, cap=INF).scalar(x, xd)

@@ -111,6 +111,77 @@ def test_nonfinite_steps_are_masked_counted_and_reset():
         assert np.isfinite(leaf).all()
 
 
+def test_a_step_is_finite_below_a_million():
+    """Observation and reward, either sign; or an environment says itself that it is
+    not. What is not finite ends, with nothing but its old observation."""
+
+    class Told:
+        """Steps to what the action says."""
+
+        def step(self, state, action):
+            obs, reward, flag, effort, done = action[:2], *action[2:]
+            metrics = {rollout.NONFINITE: flag, "effort": effort}
+            return state.replace(obs=obs, reward=reward, done=done, metrics=metrics)
+
+    good = [[5.0, -9e5, 9e5, 0.0, 2.0, 0.0], [0.0, 9e5, -9e5, 0.4, np.nan, 1.0]]
+    bad = [[1e6, 0, 0, 0, 2, 0], [0, -1e6, 0, 0, 2, 0], [0, 0, 1e6, 0, 2, 0]]
+    bad += [[0, 0, -1e6, 0, 2, 0], [0, 0, 0, 0.5, 2, 0], [np.nan, 0, 0, 0, 2, 0]]
+    action = jnp.array(good + bad)
+    k = len(action)
+    one = jnp.ones(k)
+    old = toys.ToyState(one, jnp.full((k, 2), 7.0), one, one, {}, {})
+    new, finite = rollout.finite_step(Told(), old, action)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(finite, [True, True] + [False] * len(bad))
+    np.testing.assert_array_equal(new.obs[:2], action[:2, :2])
+    np.testing.assert_array_equal(new.obs[2:], 7.0)
+    np.testing.assert_array_equal(new.reward, [9e5, -9e5] + [0.0] * len(bad))
+    np.testing.assert_array_equal(new.done, [0.0, 1.0] + [1.0] * len(bad))
+    np.testing.assert_array_equal(new.metrics["effort"], [2.0] + [0.0] * (k - 1))
+
+
+def test_the_first_bad_step_of_an_unroll_is_kept_with_what_led_to_it():
+    """Of each environment; a later unroll begins without any."""
+    env = toys.Exploding()
+
+    @jax.jit
+    def run(key):
+        keys = jax.random.split(key, NUM_ENVS)
+        state = rollout.init(env, keys)
+        state, data, _ = rollout.unroll(env, act, state, keys, LENGTH)
+        later, again, _ = rollout.unroll(env, act, state, keys, 1)
+        return (state.fault, data), (later.fault, again)
+
+    bad = np.zeros(0)
+    for fault, data in jax.device_get(run(jax.random.key(0))):
+        bad = data.weight == 0
+        np.testing.assert_array_equal(fault.happened, bad.any(axis=0))
+        first = bad.argmax(axis=0)
+        for lane in np.flatnonzero(fault.happened):
+            led = data.raw_action[first[lane], lane]
+            np.testing.assert_array_equal(fault.action[lane], led)
+            assert fault.env_state.obs[lane, 0] == 1.0
+    assert 0 < bad.sum() < NUM_ENVS  # the last unroll has both
+
+
+def test_an_environment_may_restart_from_its_last_episode():
+    """Every episode ends after a step; the first start has none before it."""
+
+    class Lives(toys.ActionChoice):
+        def restart(self, rng, ended):
+            count = 0 if ended is None else ended.data["t"] + 1
+            fresh = self.reset(rng)
+            return fresh.replace(data={"t": jnp.int32(count), "key": rng})
+
+    env, keys = Lives(), jax.random.split(jax.random.key(0), NUM_ENVS)
+    state = rollout.init(env, keys)
+    np.testing.assert_array_equal(state.env_state.data["t"], 0)
+    state, _, stats = jax.jit(
+        lambda state: rollout.unroll(env, act, state, keys, LENGTH)
+    )(state)
+    np.testing.assert_array_equal(state.env_state.data["t"], LENGTH)
+    np.testing.assert_array_equal(stats.episodes, LENGTH)
+
+
 def test_staggered_starts_spread_the_time_limit_and_count_whole_episodes_only():
     """`Counter` ends an episode by itself or by the time limit."""
     env = toys.Counter()
