@@ -15,6 +15,7 @@ OTHERS = {
     "rmp/leaves/joint_limit": "rmp/test_formulas rmp/test_leaves control/test_contact",
     "rmp/leaves/posture": "rmp/test_formulas rmp/test_leaves",
     "control/avoidance": "control/test_branches control/test_avoidance",
+    "control/guard": "control/test_guard_terms control/test_guard",
     "control/leaves": "control/test_tree_equivalence control/test_pytree",
     "control/literal": "control/test_controller rmp/test_leaves",
     "control/relaxation": "control/test_dither control/test_controller",

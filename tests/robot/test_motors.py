@@ -48,6 +48,11 @@ ACCEPTED = {
         'ctrlrange="-4 4"/>',
         8.0,
     ),
+    "gain by position": (
+        '<general name="s" joint="b" gaintype="affine" gainprm="1 .5" biastype="none" '
+        'gear="1" ctrlrange="-6 6" forcerange="-6 6"/>',
+        6.0,
+    ),
     "motor with a force range": (
         '<motor name="s" joint="b" gear="2" ctrlrange="-4 4" forcerange="-3 3"/>',
         6.0,
@@ -83,6 +88,15 @@ def test_control_is_torque_up_to_the_limit(text, limit):
     np.testing.assert_array_equal(applied(robot, [1.5, -2.5]), [1.5, -2.5])
     np.testing.assert_array_equal(applied(robot, [99, -99]), [5.0, -limit])
     assert not model.actuator_gear[:, 1:].any()  # of six gears a hinge has one
+
+
+@pytest.mark.parametrize("name", ACCEPTED)
+def test_only_a_file_of_such_motors_stays_as_it_is(name):
+    """A motor that replaces another one is in no group."""
+    text = ACCEPTED[name][0].replace('name="s"', 'name="s" group="3"')
+    robot = arm(text, first=FIRST.replace("/>", ' group="3"/>'))
+    group = 3 if name == "motor" else 0
+    assert robot.mj_model.actuator_group.tolist() == [group, group]
 
 
 def test_the_joint_may_limit_a_position_actuator():
