@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rmp_mjx import Obstacles, StopGuard
+from rmp_mjx import Obstacles, Robot, StopGuard
 from rmp_mjx.control.guard import FADE, ROUNDING, SLACK, STAGES
 from rmp_mjx.robot.configurations import capsule_ends, joint_frames, segment_distance
 from rmp_mjx.robot.dynamics import dynamics
@@ -253,3 +253,48 @@ def carried(robot, near, q, u, far):
     _, R = joint_frames(robot, q[None])
     turn = np.eye(3) if joint < 0 else R[joint, 0]
     return np.array([turn @ d for d in np.subtract(local[1], local[0]) / (2 * e)])
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_the_velocity_expected_of_a_step_is_mujocos(compensated):
+    """Of a torque that passes and of a stop, with a contact, float64: 1e-9 rad/s. The
+    Jaco 2 has damping, which the bias holds or not. A stop that has begun goes on
+    evenly, if the motors can."""
+    robot = Robot.load(compensate_passive=compensated)
+    guard, rng = StopGuard.of(robot, STEP), np.random.default_rng(0)
+    lax = guard.replace(margin=-9.0, speed=9.0, limit_margin=-9.0)
+    strict = guard.replace(margin=9.0, speed=0.0)
+
+    def both(guard, q, v, tau, ext):
+        arm = arm_state(robot, q, v)
+        Mq, bias = dynamics(robot, arm)
+        sent, found = guard(robot, arm, tau, Mq, bias, scene(), ext)
+        found["T"] = guard._stop(
+            guard._scene(robot, arm, v, Mq, ext, scene()),
+            v,
+            jnp.matmul(Mq, v, precision="highest"),
+            0.0,
+        )[0]
+        return sent, found
+
+    run = jax.jit(both, compiler_options=QUICK)
+    data = mujoco.MjData(robot.mj_model)
+    robot.mj_model.opt.timestep = STEP
+    for _ in range(8):
+        q, v = robot.q_home + rng.uniform(-0.2, 0.2, 7), rng.normal(scale=0.1, size=7)
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_forward(robot.mj_model, data)
+        tau, ext = data.qfrc_bias + 0.2 * rng.normal(size=7), 0.05 * rng.normal(size=7)
+        for one, used in ((lax, 0.0), (strict, 1.0)):
+            with jax.enable_x64(True):
+                sent, found = jax.device_get(run(one, q, v, tau, ext))
+            assert found["guard_used"] == used
+            if not used:
+                np.testing.assert_array_equal(sent, tau)
+            data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, sent
+            data.qfrc_applied[:] = ext
+            mujoco.mj_step(robot.mj_model, data)
+            np.testing.assert_allclose(data.qvel, found["guard_qd"], atol=1e-9)
+            if used:
+                expected = (1.0 - STEP / found["T"]) * v
+                np.testing.assert_allclose(data.qvel, expected, atol=1e-9)

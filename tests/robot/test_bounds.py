@@ -111,7 +111,7 @@ def test_the_holding_torque_is_the_bias_at_rest(arm):
 
 
 CHAIN = """<mujoco><worldbody><body name="base">
-<geom name="base" type="capsule" fromto="-.1 0 0 .25 0 0" size=".05"/>
+<geom name="base" type="capsule" fromto="-.4 0 0 .25 0 0" size=".05"/>
 <body name="one"><joint name="a" axis="0 0 1"/>
  <geom name="one" type="capsule" fromto="0 0 0 .4 0 0" size=".05"/>
  <body name="two" pos=".4 0 0">
