@@ -15,12 +15,14 @@ OTHERS = {
     "rmp/leaves/joint_limit": "rmp/test_formulas rmp/test_leaves control/test_contact",
     "rmp/leaves/posture": "rmp/test_formulas rmp/test_leaves",
     "control/avoidance": "control/test_branches control/test_avoidance",
+    "control/contact": "control/test_contact control/test_controller",
     "control/guard": "control/test_guard_terms control/test_guard",
     "control/leaves": "control/test_tree_equivalence control/test_pytree",
     "control/literal": "control/test_controller rmp/test_leaves",
     "control/relaxation": "control/test_dither control/test_controller",
     "control/rmp_vices": "control/test_tree_equivalence control/test_controller",
     "control/tree": "control/test_tree_equivalence",
+    "control/vices": "control/test_vices control/test_controller",
     "robot/control_points": "robot/test_control_points robot/test_model",
     "robot/dynamics": "robot/test_dynamics robot/test_motors robot/test_bounds",
     "robot/errors": "robot/test_model robot/test_mjcf",
@@ -30,7 +32,7 @@ OTHERS = {
     "robot/links": "robot/test_model robot/test_mjcf",
     "robot/model": "robot/test_model robot/test_dynamics",
     "robot/mjcf": "robot/test_mjcf robot/test_model",
-    "robot/point_state": "robot/test_bounds control/test_tree_equivalence",
+    "robot/point_state": "control/test_branches control/test_tree_equivalence",
 }
 """Tests of the modules without a test file of their own name, or with more than it."""
 

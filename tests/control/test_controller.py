@@ -17,6 +17,7 @@ from rmp_mjx import (
     rmp_vices_literal,
 )
 from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx.control.contact import ContactResponse
 from rmp_mjx.control.vices import OSC
 from rmp_mjx.rmp.leaves import collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
@@ -152,3 +153,15 @@ def test_acceleration_is_the_roots_up_to_its_regulariser(literal, act):
         (out.M + literal.regularizer * Mq) @ out.qdd, out.f, rtol=1e-6, atol=1e-6
     )
     np.testing.assert_allclose(out.M @ out.qdd, out.f, atol=1e-3 * np.abs(out.f).max())
+
+
+def test_results_depend_on_these_default_numbers(robot):
+    """Whoever changes one of them has to renew the results."""
+    ctrl, literal = RMPVICES(robot), rmp_vices_literal(robot)
+    assert (ctrl.attractor_weight, ctrl.regularizer) == (1.0, 1e-3)
+    assert (ctrl.braking_share, ctrl.period) == (0.7, 0.005)
+    assert literal.regularizer == 1e-5
+    contact = ContactResponse()
+    assert (contact.cap, contact.near) == (50.0, 0.02)
+    assert (contact.release, contact.min_weight) == (10.0, 0.01)
+    assert (VICES(robot).kq, OSC(robot).kp) == (10.0, 150.0)

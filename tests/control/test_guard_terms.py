@@ -298,3 +298,13 @@ def test_the_velocity_expected_of_a_step_is_mujocos(compensated):
             if used:
                 expected = (1.0 - STEP / found["T"]) * v
                 np.testing.assert_allclose(data.qvel, expected, atol=1e-9)
+
+
+def test_the_default_guard_has_the_numbers_that_its_runs_were_made_with(bent):
+    guard = StopGuard.of(bent)
+    assert (guard.step, guard.speed, guard.margin) == (0.005, 0.05, 0.001)
+    assert (guard.limit_margin, guard.tolerance) == (0.105, 1e-4)
+    assert (guard.obstacle_speed, guard.obstacle_error) == (0.0, 0.0)
+    assert (guard.reserve, guard.longest, guard.blends) == (0.05, 0.15, (1.0, 0.5, 0.2))
+    assert (FADE, STAGES, ROUNDING, SLACK) == (0.5, (0.2, 1.0), 1e-5, 1e-3)
+    assert not guard.leaving

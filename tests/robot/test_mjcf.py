@@ -29,8 +29,9 @@ def test_a_urdf_brings_its_limits_and_its_continuous_joints(tmp_path):
     np.testing.assert_array_equal(robot.qd_max, [2.0, 3.0])
     np.testing.assert_allclose(robot.q_lower, [-1.0, -np.inf])
     assert 0.04 < robot.capsules.radius[0] < 0.055
-    path.write_text(URDF.replace('velocity="3"', ""))
-    assert Robot.load(str(path), body="tip").qd_max is None
+    for unknown in ("", 'velocity="0"'):
+        path.write_text(URDF.replace('velocity="3"', unknown))
+        assert Robot.load(str(path), body="tip").qd_max is None
 
 
 def arm(name, y, geom="", more=""):
