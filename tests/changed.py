@@ -14,7 +14,6 @@ OTHERS = {
     "rmp/leaves/collision": "rmp/test_formulas rmp/test_leaves",
     "rmp/leaves/joint_limit": "rmp/test_formulas rmp/test_leaves control/test_contact",
     "rmp/leaves/posture": "rmp/test_formulas rmp/test_leaves",
-    "control/avoidance": "control/test_branches control/test_avoidance",
     "control/contact": "control/test_contact control/test_controller",
     "control/guard": "control/test_guard_terms control/test_guard",
     "control/leaves": "control/test_tree_equivalence control/test_pytree",
@@ -32,7 +31,7 @@ OTHERS = {
     "robot/links": "robot/test_model robot/test_mjcf",
     "robot/model": "robot/test_model robot/test_dynamics",
     "robot/mjcf": "robot/test_mjcf robot/test_model",
-    "robot/point_state": "control/test_branches control/test_tree_equivalence",
+    "robot/point_state": "control/test_avoidance control/test_tree_equivalence",
 }
 """Tests of the modules without a test file of their own name, or with more than it."""
 

@@ -78,7 +78,7 @@ def robot():
 def bent():
     """An arm that is nowhere symmetric, with a slide and a base of its own place."""
     from rmp_mjx import Robot
-    from tests.bent import BENT
+    from tests.oracles import BENT
 
     return Robot.from_mjcf(BENT, site="tip", spacing=0.05)
 

@@ -18,8 +18,8 @@ from rmp_mjx.control.guard import FADE, ROUNDING, SLACK, STAGES
 from rmp_mjx.robot.configurations import capsule_ends, joint_frames, segment_distance
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
-from tests.bent import Measured
 from tests.control.conftest import QUICK
+from tests.oracles import Measured, mujoco_terms
 
 STEP, EDGE = 0.005, 1e-6
 CENTRE, SLOW = np.array([[0.1, 0.6, 1.2], [0.9, 0.2, 0.3]]), np.array([0.01, 0.0, 0.02])
@@ -298,6 +298,42 @@ def test_the_velocity_expected_of_a_step_is_mujocos(compensated):
             if used:
                 expected = (1.0 - STEP / found["T"]) * v
                 np.testing.assert_allclose(data.qvel, expected, atol=1e-9)
+
+
+def test_as_much_of_a_torque_is_sent_as_passes(bent, guard, judge, states):
+    """The first of the shares whose blend with the stop keeps clear, at many margins;
+    without any the stop, which is proved if the last step left one."""
+    shy, seen = guard.replace(limit_margin=-9.0, speed=0.0), set()
+
+    def both(guard, q, v, tau):
+        arm = arm_state(bent, q, v)
+        Mq, bias = dynamics(bent, arm)
+        return guard(bent, arm, bias + tau, Mq, bias, scene())[1]
+
+    run, none = jax.jit(both, compiler_options=QUICK), np.zeros(4)
+    for q, v, push, _ in states[:8]:
+        Mq = mujoco_terms(bent.mj_model, "tip", q[None], v[None]).Mq[0]
+        w = v + STEP * np.linalg.solve(Mq, 20.0 * push)
+        _, (T, _), *_ = judge(shy, q, v, w, none, 1.0, 0.0, 0.0)
+        kept = max(1.0 - STEP / T, 0.0)
+        for margin in np.linspace(-0.1, 0.6, 80):
+            one = shy.replace(margin=margin)
+            passes = [
+                s
+                for s in guard.blends
+                if judge(one, q, v, w, none, (1.0 - s) * kept, s, 1.0)[0]
+            ]
+            stands = bool(judge(one, q, v, w, none, 1.0, 0.0, 0.0)[0])
+            with jax.enable_x64(True):
+                found = jax.device_get(run(one, q, v, 20.0 * push))
+            part = passes[0] if passes else 0.0
+            np.testing.assert_allclose(found["guard_used"], 1.0 - part)
+            assert found["guard_verified"] == float(bool(passes) or stands)
+            assert found["guard_assumptions"] == float(not stands)
+            expected = (1.0 - part) * kept * v + part * w
+            np.testing.assert_allclose(found["guard_qd"], expected, atol=1e-12)
+            seen.add((part, stands))
+    assert len({part for part, _ in seen}) >= 3 and len({x for _, x in seen}) == 2
 
 
 def test_the_default_guard_has_the_numbers_that_its_runs_were_made_with(bent):

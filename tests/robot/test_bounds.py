@@ -13,8 +13,8 @@ from rmp_mjx.robot.configurations import random_configurations
 from rmp_mjx.robot.dynamics import dynamics, holding_torque
 from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.robot.point_state import point_state
-from tests.bent import Measured
 from tests.control.conftest import QUICK
+from tests.oracles import Measured
 from tests.robot.test_model import GRIPPER
 
 

@@ -12,7 +12,7 @@ from rmp_mjx.robot.configurations import (
     segment_distance,
     touching_pairs,
 )
-from tests.bent import Measured
+from tests.oracles import Measured
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from rmp_mjx import Robot
 from rmp_mjx.robot.configurations import capsule_ends
 from rmp_mjx.robot.control_points import hull_corners
 from rmp_mjx.robot.enclose import distance_to_segment
-from tests.bent import BENT
+from tests.oracles import BENT
 from tests.robot.test_model import GRIPPER, ODD
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from rmp_mjx import Robot
 from rmp_mjx.robot.configurations import random_configurations
 from rmp_mjx.robot.inverse import STEP, _at_most, _error, hand_pose, reach
-from tests.bent import Measured
+from tests.oracles import Measured
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5e"])

@@ -17,8 +17,8 @@ from rmp_mjx.robot.kinematics import (
     site_pose,
 )
 from tests import oracles
-from tests.bent import Measured, along
 from tests.control.conftest import QUICK
+from tests.oracles import Measured, along
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from rmp_mjx import Robot, RobotError, RobotWarning
 from rmp_mjx.robot.configurations import capsule_gaps, random_configurations
 from rmp_mjx.robot.posture import manipulability, search_posture
-from tests.bent import Measured
+from tests.oracles import Measured
 
 
 def text(second="-2 2", key="", first=""):
