@@ -235,9 +235,9 @@ def attack(
     return {k: int(x.sum()) for k, x in counts.items()}
 
 
-def compiled(ctrl: ImpedanceController, **options: Any) -> Callable[..., Any]:
-    """A batch of inputs to outputs, jitted with these options."""
-    return jax.jit(jax.vmap(lambda given: ctrl(**given)), **options)
+def compiled(ctrl: ImpedanceController) -> Callable[..., Any]:
+    """A batch of inputs to outputs."""
+    return jax.jit(jax.vmap(lambda given: ctrl(**given)))
 
 
 def arms(seed: int) -> dict[str, rmp.Robot]:

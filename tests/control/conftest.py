@@ -12,10 +12,6 @@ BATCH = 500
 """States per call; every test uses this shape, so each program compiles once."""
 
 
-QUICK = {"xla_backend_optimization_level": 0}
-"""Compiles four times faster, for programs that a test runs only a few times."""
-
-
 def fresh(tree):
     """The tree with copies of its NumPy arrays.
 
@@ -44,7 +40,7 @@ def _controlled(ctrl, q, qd, action, obstacles, tau_ext=None):
 def run64():
     """`run64(ctrl, q, qd, action, obstacles, tau_ext)`: outputs for BATCH states, in
     float64; without tau_ext nothing touches."""
-    controlled = jax.jit(_controlled, compiler_options=QUICK)
+    controlled = jax.jit(_controlled)
 
     def run(*args):
         with jax.enable_x64(True):

@@ -26,7 +26,6 @@ from rmp_mjx.robot.configurations import capsule_gaps, random_configurations
 from rmp_mjx.robot.kinematics import arm_state, base_point, forward_kinematics
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.vec import Vec
-from tests.control.conftest import QUICK
 from tests.oracles import Measured, along
 
 
@@ -142,7 +141,7 @@ def run(bent):
             "walls": obstacle_branch(bent, arm, obstacles, leaf | {"spheres": None}),
         }
 
-    compiled = jax.jit(both, compiler_options=QUICK)
+    compiled = jax.jit(both)
 
     def call(*args):
         with jax.enable_x64(True):

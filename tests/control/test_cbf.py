@@ -12,7 +12,6 @@ from rmp_mjx.control.cbf import project
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 from tests import oracles
-from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 
 clarabel = pytest.importorskip("clarabel")
@@ -48,7 +47,7 @@ def slots():
 def run(filtered, states):
     """Output, VICES' acceleration, barriers and dynamics in all states, float32."""
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def every(q, qd, action):
         def one(q, qd, action):
             setpoint = filtered.setpoint(q, filtered.decode(action), 0.0)
@@ -122,7 +121,7 @@ def test_barriers_are_distances_and_their_time_derivatives(filtered, states):
     """
     step = 1e-4
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def at(q, qd):
         def one(q, qd):
             arm = arm_state(filtered.robot, q, qd)

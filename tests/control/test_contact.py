@@ -12,7 +12,6 @@ from rmp_mjx.rmp.leaves import collision_near
 from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier, RMPflowJointLimit
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, site_state
-from tests.control.conftest import QUICK
 
 N = 7
 
@@ -71,7 +70,7 @@ def test_attractors_let_go_as_contacts_press():
 def answer(robot):
     """The controller beside a sphere, with a contact torque."""
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def call(ctrl, q, tau_ext, center):
         setpoint = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
         slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
@@ -124,7 +123,7 @@ def _world_points(robot, q):
         yield body, data.xpos[b] + data.xmat[b].reshape(3, 3) @ offset, radius
 
 
-@jax.jit(compiler_options=QUICK)
+@jax.jit
 def hand(robot, q):
     """Inertia and Jacobians at the hand."""
     arm = arm_state(robot, q, jnp.zeros_like(q))
@@ -132,7 +131,7 @@ def hand(robot, q):
     return dynamics(robot, arm)[0], site.J_pos, site.J_ori
 
 
-@jax.jit(compiler_options=QUICK)
+@jax.jit
 def turning(robot, q, w):
     """The turn that a blocking force gives the hand."""
     arm = arm_state(robot, q, jnp.zeros_like(q))
@@ -171,7 +170,7 @@ def test_gradients_through_the_response_are_finite(answer, robot):
         slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
         return jnp.sum(ctrl(q, 0.0 * q, setpoint, slots, tau_ext).tau)
 
-    slope = jax.jit(jax.grad(loss, (0, 1)), compiler_options=QUICK)
+    slope = jax.jit(jax.grad(loss, (0, 1)))
     for size in (0.0, 1.0, 100.0):
         for center in ([0.3, 0.0, 0.1], [0.0, 0.0, -5.0]):
             found = slope(jnp.full(N, size), jnp.array(center))

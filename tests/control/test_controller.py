@@ -23,7 +23,6 @@ from rmp_mjx.rmp.leaves import collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, site_state
 from rmp_mjx.shapes import KINDS
-from tests.control.conftest import QUICK
 from tests.envs.arm_tasks import Torques
 from tests.robot.test_model import GRIPPER
 
@@ -111,7 +110,7 @@ def literal():
 def act(literal):
     """Output, site, inertia and limiter's metric; float64."""
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def run(q, qd, center):
         slots = Obstacles.empty(spheres=1).with_spheres(center[None], 0.05)
         setpoint = literal.setpoint(q, literal.decode(ACTION), 0.0)

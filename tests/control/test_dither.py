@@ -7,7 +7,7 @@ import pytest
 
 from rmp_mjx import RMPVICES, Obstacles, OrientationRelaxation, Robot, SetpointDither
 from rmp_mjx.control.relaxation import joint_limit_relaxation
-from tests.control.conftest import QUICK, changed
+from tests.control.conftest import changed
 from tests.robot.test_model import GRIPPER
 
 STILL = jnp.zeros(3)
@@ -75,7 +75,7 @@ def test_a_plain_loop_dithers_beside_a_body_and_nowhere_else():
         setpoint = ctrl.setpoint(q, ctrl.decode(policy), 0.0)
         return ctrl(q, qd, setpoint, slots).diagnostics["clearance"]
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def loop(away):
         grip = ctrl.setpoint(q, ctrl.decode(policy), 0.0).p_des
         center = grip + jnp.array([0.1, 0.0, 0.0])

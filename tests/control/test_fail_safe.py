@@ -17,7 +17,7 @@ from rmp_mjx.rmp import RMP
 from rmp_mjx.rmp.leaves.joint_limit import JointLimitBarrier
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
-from tests.control.conftest import QUICK, changed
+from tests.control.conftest import changed
 from tests.robot.test_model import GRIPPER
 
 BATCH = 512
@@ -41,7 +41,7 @@ def run(robot):
     def run(name, given):
         if name not in made:
             ctrl = faults.controllers(robot)[name]
-            made[name] = faults.compiled(ctrl, compiler_options=QUICK)
+            made[name] = faults.compiled(ctrl)
         return made[name](given)
 
     return run
@@ -75,7 +75,7 @@ def spoilt(sampler, name, value=np.nan, seed=0):
 def model(robot):
     """Inertia and bias of a batch of states."""
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def model(q, qd):
         return jax.vmap(lambda q, qd: dynamics(robot, arm_state(robot, q, qd)))(q, qd)
 
@@ -139,7 +139,7 @@ def test_a_torque_that_is_not_finite_makes_the_state_unusable_guarded_too(robot)
     for guard in (None, StopGuard.of(robot)):
         ctrl = Lost(robot, guard=guard)
         setpoint = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
-        out = jax.jit(ctrl, compiler_options=QUICK)(q, q, setpoint, none)
+        out = jax.jit(ctrl)(q, q, setpoint, none)
         assert out.diagnostics["usable"] == 0.0 and not out.qdd.any()
         assert np.all(np.abs(out.tau) <= robot.tau_max) and out.tau.any()
         assert not any(x.any() for x in out.diagnostics.values())
@@ -162,7 +162,7 @@ def test_gradients_are_finite_in_hostile_states():
     arm = random_chain(0, joints=7)
     ctrl, sampler = VICES(arm), faults.Sampler(arm)
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     @jax.vmap
     def slope(given):
         def torque(q, qd, setpoint):
@@ -262,7 +262,7 @@ def test_traced_numbers_pass_and_make_the_state_unusable(robot):
     q = jnp.zeros(3)
     setpoint = ctrl.setpoint(q, ctrl.decode(jnp.zeros(12)), 0.0)
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def flag(x, eps):
         RMPVICES(robot, regularizer=eps)
         slots = SLOTS.with_spheres([[x, 0.0, 0.0]], 0.1).with_planes(

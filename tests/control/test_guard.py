@@ -15,7 +15,6 @@ from rmp_mjx.robot.bounds import Bounds
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.robot.point_state import point_state
-from tests.control.conftest import QUICK
 
 STEP, SPEED, RADIUS = 0.005, 0.2, 0.05
 """Control step [s], speed [m/s] and radius [m] of the spheres."""
@@ -64,7 +63,7 @@ def test_distances_keep_to_their_bounds_along_a_line(robot, guard):
             self_gaps(robot, arm)[0],
         )
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def excess(q, u, obstacles):
         size = jnp.abs(u)
         squares = jnp.outer(size, size).reshape(-1)
@@ -282,7 +281,7 @@ def test_a_controller_sends_what_its_guard_lets_pass(robot, guard, vices, states
     """And its own torque, bit for bit, where that passes."""
     obstacles = Obstacles.empty(spheres=1).with_spheres([[0.3, 0.1, 0.3]], 0.05)
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     @jax.vmap
     def both(q, qd, action):
         setpoint = vices.setpoint(q, vices.decode(action), 0.0)

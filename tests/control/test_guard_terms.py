@@ -18,7 +18,6 @@ from rmp_mjx.control.guard import FADE, ROUNDING, SLACK, STAGES
 from rmp_mjx.robot.configurations import capsule_ends, joint_frames, segment_distance
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
-from tests.control.conftest import QUICK
 from tests.oracles import Measured, mujoco_terms
 
 STEP, EDGE = 0.005, 1e-6
@@ -71,7 +70,7 @@ def judge(bent):
             Mu,
         )
 
-    compiled = jax.jit(both, compiler_options=QUICK)
+    compiled = jax.jit(both)
 
     def run(*args):
         with jax.enable_x64(True):
@@ -277,7 +276,7 @@ def test_the_velocity_expected_of_a_step_is_mujocos(compensated):
         )[0]
         return sent, found
 
-    run = jax.jit(both, compiler_options=QUICK)
+    run = jax.jit(both)
     data = mujoco.MjData(robot.mj_model)
     robot.mj_model.opt.timestep = STEP
     for _ in range(8):
@@ -310,7 +309,7 @@ def test_as_much_of_a_torque_is_sent_as_passes(bent, guard, judge, states):
         Mq, bias = dynamics(bent, arm)
         return guard(bent, arm, bias + tau, Mq, bias, scene())[1]
 
-    run, none = jax.jit(both, compiler_options=QUICK), np.zeros(4)
+    run, none = jax.jit(both), np.zeros(4)
     for q, v, push, _ in states[:8]:
         Mq = mujoco_terms(bent.mj_model, "tip", q[None], v[None]).Mq[0]
         w = v + STEP * np.linalg.solve(Mq, 20.0 * push)

@@ -9,7 +9,6 @@ from rmp_mjx import Obstacles
 from rmp_mjx.robot.kinematics import arm_state, base_point, site_pose
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.types import Setpoint
-from tests.control.conftest import QUICK
 
 
 def _rounded(tree):
@@ -82,7 +81,7 @@ def gradient():
         out = ctrl.replace(**parts)(q, qd, setpoint, slots)
         return jnp.sum(out.tau) + jnp.sum(out.qdd) + jnp.sum(out.M)
 
-    return jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3, 4)), compiler_options=QUICK)
+    return jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3, 4)))
 
 
 def _parts(ctrl):

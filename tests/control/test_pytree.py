@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import functools
 import re
 import typing
 from typing import Any
@@ -23,7 +22,6 @@ from rmp_mjx.rmp import TaskMap, pushforward
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, site_state
 from rmp_mjx.robot.point_state import point_state
-from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 
 
@@ -46,7 +44,7 @@ def traces():
 def torque(traces):
     """The controller as a jitted function of itself, counting its traces."""
 
-    @functools.partial(jax.jit, compiler_options=QUICK)
+    @jax.jit
     def torque(ctrl, q, qd, action, obstacles):
         traces.append(1)
         return ctrl(q, qd, ctrl.setpoint(q, ctrl.decode(action), 0.0), obstacles).tau
@@ -103,7 +101,7 @@ def test_vmap_over_a_leaf_parameter_equals_a_loop(small, torque, near):
     def at(mu, eps):
         return torque.__wrapped__(tuned(mu, eps), *STATE, near)
 
-    batch = jax.jit(jax.vmap(at), compiler_options=QUICK)(values, 10 * values)
+    batch = jax.jit(jax.vmap(at))(values, 10 * values)
     loop = [torque(tuned(mu, 10 * mu), *STATE, near) for mu in values]
     np.testing.assert_allclose(batch, np.array(loop), rtol=1e-4, atol=1e-5)
     assert np.abs(np.diff(batch, axis=0)).max() > 1e-3
@@ -114,7 +112,7 @@ def test_vmap_over_states_equals_a_loop(small, torque, near):
     q, qd = (rng.normal(size=(4, 3)).astype("f") for _ in range(2))
     action = rng.uniform(-1, 1, (4, 12)).astype("f")
     many = jax.vmap(torque.__wrapped__, in_axes=(None, 0, 0, 0, None))
-    batch = jax.jit(many, compiler_options=QUICK)(small, q, qd, action, near)
+    batch = jax.jit(many)(small, q, qd, action, near)
     loop = [torque(small, *state, near) for state in zip(q, qd, action, strict=True)]
     # Float32 with other fusions, through the root's condition: 1e-3 of the arm's limits
     # of 8 N m (3e-3 N m was seen), as for nine in ten states in test_precision.
@@ -140,7 +138,7 @@ def test_an_arm_among_no_obstacles_has_infinite_clearance(small):
     q, qd, action = (jnp.asarray(x) for x in STATE)
     bare = small.replace(leaves=Leaves(collision=small.leaves.collision))
 
-    @functools.partial(jax.jit, compiler_options=QUICK)
+    @jax.jit
     def run(ctrl, q):
         setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)
         return ctrl(q, qd, setpoint, Obstacles.empty())
@@ -158,9 +156,6 @@ CONTROLLERS = {
     "osc": OSC,
     "rmp_vices_literal": rmp_vices_literal,
 }
-
-
-quick = functools.partial(jax.jit, compiler_options=QUICK)
 
 
 def in_a_scan(f):
@@ -213,8 +208,8 @@ def test_a_scan_of_the_jitted_controller_gives_its_torque(small, near):
     q, qd, action = (jnp.asarray(x) for x in STATE)
     ctrl = small.replace(leaves=small.leaves.replace(self_collision=None))
     args = (q, qd, ctrl.setpoint(q, ctrl.decode(action), 0.4), near)
-    tau = quick(ctrl)(*args).tau
-    scanned = quick(in_a_scan(ctrl))(*args)
+    tau = jax.jit(ctrl)(*args).tau
+    scanned = jax.jit(in_a_scan(ctrl))(*args)
     np.testing.assert_allclose(scanned, [tau, tau], rtol=1e-4, atol=1e-4)
 
 
@@ -224,7 +219,7 @@ def test_a_gradient_by_the_controller_is_a_controller(small: Any, near):
     leaves = small.leaves.replace(self_collision=None)
     ctrl = jax.tree.map(jnp.float32, small.replace(leaves=leaves))
 
-    @quick
+    @jax.jit
     @jax.grad
     def slope(ctrl):
         setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.4)
@@ -349,7 +344,7 @@ def test_what_a_step_computes_is_as_annotated(slim):
     setpoint = ctrl.setpoint(q, action, 0.4)
     slots = Obstacles.empty(spheres=2, planes=1, capsules=1, boxes=1)
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def compute(q, qd):
         arm = arm_state(slim, q, qd)
         states = arm, site_state(slim, arm), point_state(slim, arm)

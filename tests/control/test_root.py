@@ -13,13 +13,12 @@ from rmp_mjx import RMPVICES, Obstacles, Robot
 from rmp_mjx.control.root import Rows, solve_root
 from rmp_mjx.math import psd_solve
 from rmp_mjx.robot.errors import RobotError
-from tests.control.conftest import QUICK
 from tests.robot.test_model import GRIPPER
 
 N = 7
 
 
-@jax.jit(compiler_options=QUICK)
+@jax.jit
 @jax.vmap
 def limited(H, f, Mq, bias, tau_max):
     """Torque, acceleration and rows at their ends, for many states."""
@@ -27,7 +26,7 @@ def limited(H, f, Mq, bias, tau_max):
     return jnp.matmul(Mq, qdd, precision="highest") + bias, qdd, at_end
 
 
-@jax.jit(compiler_options=QUICK)
+@jax.jit
 @jax.vmap
 def free(H, f):
     return psd_solve(H, f)
@@ -186,7 +185,7 @@ def test_no_root_is_lost_in_float32_where_more_rows_hold_than_joints():
     bias = np.array([0.4217, -54.94, -2.766, 15.62, -0.5396, -0.2931, -0.0003693])
     most = np.array([83.13, 77.74, 45.45, 54.2, 91.09, 77.03, 81.41])
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, 0, None, None, None, None))
     def root(H, f, Mq, low, high, most):
         torque, speed = Rows.hard(Mq, low, high), Rows.soft(jnp.eye(N), -most, most)
@@ -254,7 +253,7 @@ def test_joints_are_held_below_their_speed(run64, quick_arm, states, obstacles):
 def test_torque_changes_by_its_rate_at_most(quick_arm, robot):
     """To the last bit of float32."""
 
-    @jax.jit(compiler_options=QUICK)
+    @jax.jit
     def torque(ctrl, q, last):
         setpoint = ctrl.setpoint(q, ctrl.decode(jnp.ones(12)), 0.0)
         return ctrl(q, 0.0 * q, setpoint, Obstacles.empty(), None, last).tau

@@ -1,6 +1,5 @@
 """The fast evaluation against the tree that defines it, in float64."""
 
-import functools
 from typing import Any
 
 import jax
@@ -22,9 +21,7 @@ from rmp_mjx.control.tree import rmp_vices_tree
 from rmp_mjx.rmp.leaves import PaperCollision, collision_near, collision_transit
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, point_positions, site_state
-from tests.control.conftest import QUICK, fresh
-
-quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
+from tests.control.conftest import fresh
 
 
 class Definition(AutodiffRMPVICES):
@@ -179,7 +176,7 @@ def test_the_heaviest_posture_takes_little_from_a_safety_leaf_at_its_cap(ctrl):
     robot, rng = ctrl.robot, np.random.default_rng(0)
     q = robot.q_home + rng.uniform(-0.8, 0.8, (300, 7))
 
-    @quick_jit
+    @jax.jit
     @jax.vmap
     def parts(q):
         arm = arm_state(robot, q, jnp.zeros(7))
@@ -248,7 +245,7 @@ def test_acceleration_is_that_of_the_flattened_least_squares(run64, robot, input
     ctrl = RMPVICES(robot.replace(tau_max=np.full(7, 1e12)))
     fast = run64(ctrl, *inputs)
 
-    @quick_jit
+    @jax.jit
     def leaf_terms(ctrl, q, qd, action, obstacles):
         Mq, _ = dynamics(ctrl.robot, arm_state(ctrl.robot, q, qd))
         setpoint = ctrl.setpoint(q, ctrl.decode(action), 0.0)

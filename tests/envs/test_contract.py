@@ -210,7 +210,8 @@ def test_a_reset_inside_the_step_starts_a_new_episode(limp):
     new = done[-1] == 1
     fresh = jax.jit(env.reset)(raw_keys(7))
     assert np.any(new)
-    np.testing.assert_array_equal(state.obs[new], fresh.obs[new])
+    # Two programs of the same reset: float32 rounds otherwise in the last place.
+    np.testing.assert_allclose(state.obs[new], fresh.obs[new], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("full", [True, False])

@@ -1,7 +1,5 @@
 """The arm's kinematics and dynamics in one compiled function, in float64."""
 
-import functools
-
 import jax
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ import pytest
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state, base_point, site_state
 from rmp_mjx.robot.point_state import point_state
-from tests.control.conftest import QUICK
 from tests.oracles import Terms
 
 
@@ -20,7 +17,7 @@ def ours():
     One compilation per robot.
     """
 
-    @functools.partial(jax.jit, compiler_options=QUICK)
+    @jax.jit
     @lambda f: jax.vmap(f, in_axes=(None, 0, 0))
     def at(robot, q, qd):
         arm = arm_state(robot, q, qd)

@@ -13,7 +13,6 @@ from rmp_mjx.robot.configurations import random_configurations
 from rmp_mjx.robot.dynamics import dynamics, holding_torque
 from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.robot.point_state import point_state
-from tests.control.conftest import QUICK
 from tests.oracles import Measured
 from tests.robot.test_model import GRIPPER
 
@@ -69,7 +68,7 @@ def motion(arm):
             "levers": (later, bounds.levers(R, qd, 0.2)),
         }
 
-    compiled = jax.jit(both, compiler_options=QUICK)
+    compiled = jax.jit(both)
 
     def run(q, qd):
         with jax.enable_x64(True):

@@ -17,7 +17,6 @@ from rmp_mjx.robot.kinematics import (
     site_pose,
 )
 from tests import oracles
-from tests.control.conftest import QUICK
 from tests.oracles import Measured, along
 
 
@@ -104,7 +103,7 @@ def test_an_arm_with_a_slide_and_a_base_of_its_own_moves_as_mujocos(bent, ours):
     points = [measured.points(q_k) for q_k in q]
     np.testing.assert_allclose(x, points, rtol=0, atol=1e-12)
     with jax.enable_x64(True):
-        move = jax.jit(jax.vmap(point_positions, (None, 0)), compiler_options=QUICK)
+        move = jax.jit(jax.vmap(point_positions, (None, 0)))
         alone = move(bent, q)
         np.testing.assert_allclose(alone, points, rtol=0, atol=1e-12)
     for k in range(5):  # central differences: 1e-4 of 30 m/s^2
@@ -119,7 +118,7 @@ def test_points_of_the_fixed_base_stay_in_the_world(bent):
     segment = np.array([-1, 3, -1, 0])
     q = random_configurations(bent, 1)[0]
     with jax.enable_x64(True):
-        arm = jax.jit(arm_state, compiler_options=QUICK)(bent, q, jnp.zeros(4))
+        arm = jax.jit(arm_state)(bent, q, jnp.zeros(4))
         x, carrier = carry_points(bent, arm, offset, segment)
         world = x.stack(1) + base_point(bent)[None]
     p, R = joint_frames(bent, q[None])

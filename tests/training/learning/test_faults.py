@@ -19,13 +19,15 @@ from tests.training.conftest import SMALL, bits, small
 
 CONFIG = small()
 ITERATIONS = 4
+OPTIMISED = {"xla_backend_optimization_level": 3}
+"""As users compile."""
 
 
 def iterations(env):
     """State, and the count of bad steps, after a few iterations."""
     ppo = make_ppo(env, CONFIG.ppo)
     state = jax.jit(ppo.init)(jax.random.key(0))
-    iterate, bad = jax.jit(ppo.iterate), 0
+    iterate, bad = jax.jit(ppo.iterate, compiler_options=OPTIMISED), 0
     for _ in range(ITERATIONS):
         state, stats, _ = iterate(state)
         bad += int(stats.nonfinite)
