@@ -1,6 +1,7 @@
 """Torque limits and the time to stop: properties by hypothesis, in float32."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -96,9 +97,10 @@ def test_the_range_of_accelerations_ends_just_below_the_greatest_speeds(
     """Held for five periods, with what contacts add, the joints come to 99 % of their
     greatest speed, either way. 1e-5: float32."""
     most = np.array([0.5, 2.0, 4.0])
-    for w in (None, contact):
+    for w in (None, jnp.asarray(contact)):
         felt = 0.0 if w is None else contact
-        for side, held in zip((-1, 1), speed_range(most, qd, w, period), strict=True):
+        found = speed_range(most, jnp.asarray(qd), w, period)
+        for side, held in zip((-1, 1), found, strict=True):
             reached = qd + (np.asarray(held, float) + felt) * 5 * period
             np.testing.assert_allclose(reached, side * 0.99 * most, atol=1e-5)
     assert HORIZON == 5
