@@ -30,7 +30,8 @@ OTHERS = {
     "robot/limits": "robot/test_model robot/test_mjcf robot/test_library",
     "robot/links": "robot/test_model robot/test_mjcf",
     "robot/model": "robot/test_model robot/test_dynamics",
-    "robot/mjcf": "robot/test_mjcf robot/test_model",
+    "robot/mjcf": "robot/test_mjcf robot/test_model robot/test_motors",
+    "robot/motors": "robot/test_motors robot/test_mjcf",
     "robot/point_state": "control/test_avoidance control/test_tree_equivalence",
 }
 """Tests of the modules without a test file of their own name, or with more than it."""

@@ -43,6 +43,15 @@ ACCEPTED = {
         '<motor name="s" joint="b" gear="-3" ctrlrange="-4 5"/>',
         12.0,
     ),
+    "motor that only turns back": (
+        '<motor name="s" joint="b" gear="-1" ctrlrange="-4 4"/>',
+        4.0,
+    ),
+    "gain that turns back": (
+        '<general name="s" joint="b" gainprm="-1" biastype="none" gear="1" '
+        'ctrlrange="-4 4"/>',
+        4.0,
+    ),
     "gain": (
         '<general name="s" joint="b" gainprm="2" biastype="none" gear="1" '
         'ctrlrange="-4 4"/>',
