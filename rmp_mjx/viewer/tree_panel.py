@@ -55,4 +55,5 @@ class TreePanel:
     def hide(self) -> None:
         """Draw nothing."""
         self.thoughts.hide()
-        self.bars.content, self._pictures = "", 0
+        if self.bars.content:  # else every picture would send it anew
+            self.bars.content, self._pictures = "", 0
