@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import mujoco
 import numpy as np
 from scipy import sparse
@@ -158,3 +159,14 @@ def along(distances, q, qd, step=1e-4):
         for e in step * np.eye(len(q))
     ]
     return rate, acceleration / step, np.stack(columns, axis=1)
+
+
+def in_float64(function):
+    """The function compiled and called in float64, with what it returns as NumPy."""
+    compiled = jax.jit(function)
+
+    def run(*args):
+        with jax.enable_x64(True):
+            return jax.device_get(compiled(*args))
+
+    return run

@@ -26,7 +26,7 @@ from rmp_mjx.robot.configurations import capsule_gaps, random_configurations
 from rmp_mjx.robot.kinematics import arm_state, base_point, forward_kinematics
 from rmp_mjx.robot.point_state import point_state
 from rmp_mjx.vec import Vec
-from tests.oracles import Measured, along
+from tests.oracles import Measured, along, in_float64
 
 
 @jax.jit
@@ -141,13 +141,7 @@ def run(bent):
             "walls": obstacle_branch(bent, arm, obstacles, leaf | {"spheres": None}),
         }
 
-    compiled = jax.jit(both)
-
-    def call(*args):
-        with jax.enable_x64(True):
-            return jax.device_get(compiled(*args))
-
-    return call
+    return in_float64(both)
 
 
 @pytest.fixture(scope="module")

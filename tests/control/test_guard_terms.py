@@ -18,7 +18,7 @@ from rmp_mjx.control.guard import FADE, ROUNDING, SLACK, STAGES
 from rmp_mjx.robot.configurations import capsule_ends, joint_frames, segment_distance
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
-from tests.oracles import Measured, mujoco_terms
+from tests.oracles import Measured, in_float64, mujoco_terms
 
 STEP, EDGE = 0.005, 1e-6
 CENTRE, SLOW = np.array([[0.1, 0.6, 1.2], [0.9, 0.2, 0.3]]), np.array([0.01, 0.0, 0.02])
@@ -70,13 +70,7 @@ def judge(bent):
             Mu,
         )
 
-    compiled = jax.jit(both)
-
-    def run(*args):
-        with jax.enable_x64(True):
-            return jax.device_get(compiled(*args))
-
-    return run
+    return in_float64(both)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from rmp_mjx.robot.configurations import random_configurations
 from rmp_mjx.robot.dynamics import dynamics, holding_torque
 from rmp_mjx.robot.kinematics import arm_state
 from rmp_mjx.robot.point_state import point_state
-from tests.oracles import Measured
+from tests.oracles import Measured, in_float64
 from tests.robot.test_model import GRIPPER
 
 
@@ -68,13 +68,7 @@ def motion(arm):
             "levers": (later, bounds.levers(R, qd, 0.2)),
         }
 
-    compiled = jax.jit(both)
-
-    def run(q, qd):
-        with jax.enable_x64(True):
-            return jax.device_get(compiled(q, qd))
-
-    return run
+    return in_float64(both)
 
 
 @settings(max_examples=200, deadline=None)
