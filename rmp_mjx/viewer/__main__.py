@@ -11,6 +11,7 @@ from rich.console import Console
 
 from rmp_mjx import runtime
 from rmp_mjx.fields import arguments
+from rmp_mjx.names import unknown
 from rmp_mjx.robot import Robot, robots
 from rmp_mjx.viewer.dials import CONTROLLERS
 from rmp_mjx.viewer.things import SCENES
@@ -54,11 +55,18 @@ def _page(options: argparse.Namespace, rest: list[str]) -> Any:
         raise ValueError("--worst and --watch need --run RUN")
     if rest:
         raise ValueError(f"unknown: {' '.join(rest)}. See --help")
+    from rmp_mjx.viewer.objects import NONE
     from rmp_mjx.viewer.page import Page
     from rmp_mjx.viewer.session import Session
 
     runtime.configure()
-    session = Session(Robot.load(options.robot), options.controller, options.scene)
+    scene, objects = options.scene, NONE
+    if scene in SCENES:
+        arm = Robot.load(options.robot)
+    else:
+        arm, objects = _in_task(scene, options.robot)
+        scene = "free"
+    session = Session(arm, options.controller, scene, objects)
     return Page(
         session,
         options.robot,
@@ -86,6 +94,20 @@ def _task(options: argparse.Namespace, rest: list[str]) -> Any:
     episode = options.episode
     files = episode_page.of_run(options.run) if episode is None else [episode]
     return episode_page.EpisodePage(files, *where)
+
+
+def _in_task(task: str, robot: str) -> Any:
+    """An arm and the objects of a task.
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    import rmp_mjx_envs
+
+    known = rmp_mjx_envs.names()
+    if task not in known and ":" not in task:
+        raise ValueError(unknown("scene", task, [*SCENES, *known]))
+    return rmp_mjx_envs.live.scene(task, robot)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -118,7 +140,12 @@ def _parser() -> argparse.ArgumentParser:
         choices=list(CONTROLLERS),
         help="who drives; an arm for each",
     )
-    add("--scene", default="sphere", choices=list(SCENES), help="things to begin with")
+    add(
+        "--scene",
+        default="sphere",
+        help=f"things to begin with: {', '.join(SCENES)}; or a task, for its objects: "
+        "door, push",
+    )
     add("--show", default="meshes", choices=["meshes", "capsules"], help="the arm as")
     add("--port", type=int, default=8080, help="the next free one if it is taken")
     add("--seconds", type=float, help="end after so long; default: never")

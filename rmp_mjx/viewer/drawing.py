@@ -127,7 +127,7 @@ def capsule_parts(
     p, R = (np.asarray(x, float) for x in forward_kinematics(robot, q))
     origin = np.asarray(base_point(robot), float)
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.q_ref
+    data.qpos[: robot.n] = robot.q_ref
     mujoco.mj_kinematics(model, data)
     parts, caps = [], robot.capsules
     for start, end, radius, joint in zip(

@@ -70,7 +70,7 @@ class Page(Stage):
         insight = self.session.think(frame)
         with self.server.atomic():
             for bodies, arm in zip(self._arms, frame.arms, strict=True):
-                self._data.qpos[:] = arm.q
+                self._data.qpos[:] = [*arm.q, *arm.rest[0]]
                 mujoco.mj_kinematics(self.session.model, self._data)
                 bodies.move(self._data)
             self.tree.show(insight, frame.controllers[0])
@@ -98,11 +98,11 @@ class Page(Stage):
             for frame in frames:
                 physics.resize(model, frame.things, self.session.floor)
                 physics.place(model, things, frame.things)
-                things.qpos[:] = frame.arms[0].q
+                things.qpos[:] = [*frame.arms[0].q, *frame.arms[0].rest[0]]
                 mujoco.mj_forward(model, things)
                 renderer.update_scene(things, seen)
                 for other in frame.arms[1:]:
-                    arm.qpos[:] = other.q
+                    arm.qpos[:] = [*other.q, *other.rest[0]]
                     mujoco.mj_forward(model, arm)
                     mujoco.mjv_addGeoms(model, arm, look, hand, movable, renderer.scene)
                 drawn.append(renderer.render().copy())
@@ -156,11 +156,13 @@ class Page(Stage):
         while len(self._arms) < count:
             k = len(self._arms)
             tint = GHOSTS[(k - 1) % len(GHOSTS)] if k else None
+            geoms = [g for g in range(model.ngeom) if not physics.is_thing(model, g)]
+            parts = drawing.mesh_parts(model, geoms, tint)
             if self.show == "capsules":
-                parts = drawing.capsule_parts(robot, model, tint)
-            else:
-                arm = (g for g in range(model.ngeom) if not physics.is_thing(model, g))
-                parts = drawing.mesh_parts(model, arm, tint)
+                names = self.session.objects.geoms
+                own = {int(model.geom(name).bodyid[0]) for name in names}
+                beside = [part for part in parts if part[0] in own]
+                parts = drawing.capsule_parts(robot, model, tint) + beside
             opacity = 0.45 if k else None
             self._arms.append(
                 drawing.Bodies(self.server.scene, model, f"/arm{k}", parts, opacity)

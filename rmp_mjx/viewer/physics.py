@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import mujoco
 import numpy as np
 
 from rmp_mjx.robot import Robot
+from rmp_mjx.viewer.objects import Objects
 from rmp_mjx.viewer.things import SLOTS, Thing
 
 _TYPES = {
@@ -21,15 +22,16 @@ _CONTACTS = (
     mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
 )
 _FAR = 100.0
-"""Where unused slots wait, below the floor [m]."""
+"""So far below the base is what is not in use [m]."""
 
 
-def build(robot: Robot, period: float) -> mujoco.MjModel:
-    """The arm, a floor and `SLOTS` things; the arm's links touch things only.
+def build(robot: Robot, period: float, objects: Objects) -> mujoco.MjModel:
+    """The arm, a floor, `SLOTS` things and a task's objects; no link touches another.
 
     Args:
-        robot: The arm.
+        robot: The arm; its joints come first.
         period: Timestep [s].
+        objects: What physics moves besides the arm.
     """
     spec = robot.mj_spec
     spec.option.timestep = period
@@ -40,26 +42,26 @@ def build(robot: Robot, period: float) -> mujoco.MjModel:
         geom.contype = 1
     floor = spec.worldbody.add_geom(name="thing/floor")
     floor.type, floor.size = mujoco.mjtGeom.mjGEOM_PLANE, [0.0, 0.0, 0.05]
-    floor.contype = floor.conaffinity = 0
+    floor.contype, floor.conaffinity, floor.pos = 0, 1, [0.0, 0.0, -_FAR]
     for kind, count in SLOTS.items():
         for k in range(count):
             body = spec.worldbody.add_body(name=f"thing/{kind}{k}", mocap=True)
             geom = body.add_geom(name=f"thing/{kind}{k}")
             geom.type, geom.size = _TYPES[kind], [1.0, 1.0, 1.0]
             geom.contype, geom.conaffinity = 0, 1
+    objects.attach(spec)
     return spec.compile()
 
 
 def is_thing(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom is a thing in the arm's way, not a part of the arm."""
+    """Whether a geom is one of the things that users move, or the floor."""
     return model.geom(geom).name.startswith("thing/")
 
 
 def resize(model: mujoco.MjModel, things: Sequence[Thing], floor: float | None) -> None:
     """Give the slots their sizes, and the floor its height."""
     plane = model.geom("thing/floor").id
-    model.geom_conaffinity[plane] = floor is not None
-    model.geom_pos[plane, 2] = floor or 0.0
+    model.geom_pos[plane, 2] = -_FAR if floor is None else floor
     for name, thing in _slots(things):
         geom = model.geom(name).id
         half = _half(thing)
@@ -80,7 +82,7 @@ def place(model: mujoco.MjModel, data: mujoco.MjData, things: Sequence[Thing]) -
 
 
 def contact_torque(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Joint torque of all contacts in the last step, (nv,) [N m]."""
+    """Torque of all contacts on each joint in the last step, (nv,) [N m]."""
     torque = np.zeros(model.nv)
     if data.nefc:
         force = np.where(np.isin(data.efc_type, _CONTACTS), data.efc_force, 0.0)
@@ -88,12 +90,21 @@ def contact_torque(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     return torque
 
 
-def contact_force(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Sum of the normal forces of all contacts in the last step [N]."""
+def contact_force(
+    model: mujoco.MjModel, data: mujoco.MjData, work: Set[int] = frozenset()
+) -> float:
+    """Sum of the normal forces of all contacts in the last step [N].
+
+    Args:
+        model: The model.
+        data: Its state.
+        work: Geoms that the hand may touch, by id; their contacts are left out.
+    """
     wrench, total = np.zeros(6), 0.0
-    for k in range(data.ncon):
-        mujoco.mj_contactForce(model, data, k, wrench)
-        total += wrench[0]
+    for k, contact in enumerate(data.contact):
+        if work.isdisjoint(contact.geom):
+            mujoco.mj_contactForce(model, data, k, wrench)
+            total += wrench[0]
     return total
 
 

@@ -12,15 +12,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rmp_mjx.control.avoidance import obstacle_gaps
-from rmp_mjx.math import exp_so3, log_so3, quat_to_mat
 from rmp_mjx.names import unknown
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot import Robot
-from rmp_mjx.robot.kinematics import arm_state, site_pose
-from rmp_mjx.robot.point_state import point_state
-from rmp_mjx.types import Setpoint
+from rmp_mjx.robot.kinematics import site_pose
 from rmp_mjx.viewer import physics
 from rmp_mjx.viewer.dials import (
     CONTROLLERS,
@@ -28,17 +25,15 @@ from rmp_mjx.viewer.dials import (
     as_python,
     dials,
     make,
-    named,
-    turned,
 )
-from rmp_mjx.viewer.insight import Insight, on_host, think
+from rmp_mjx.viewer.insight import Insight, on_host
+from rmp_mjx.viewer.objects import NONE, Objects
 from rmp_mjx.viewer.player import kept
+from rmp_mjx.viewer.steps import control, thought
 from rmp_mjx.viewer.things import SCENES, SLOTS, Thing, obstacles
 
 PERIOD = 0.005
 """Physics and control timestep [s]."""
-LEAD = (0.05, 0.2)
-"""The set-point is at most so far ahead of the hand [m, rad], as a policy's is."""
 KP = 150.0
 """Stiffness at the start [1/s^2]."""
 _TREES = ("rmp_vices", "rmp_vices_literal")
@@ -60,7 +55,11 @@ class Numbers(NamedTuple):
     clearance: float
     """Least distance of a control point to a thing or the floor [m]."""
     force: float
-    """Sum of the contacts' normal forces [N]."""
+    """Sum of the contacts' normal forces, without those of the hand's work [N]."""
+    rest: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
+    """Positions and velocities of the joints of a task's objects."""
+    objects: tuple[Thing, ...] = ()
+    """The objects."""
 
 
 class Frame(NamedTuple):
@@ -86,15 +85,27 @@ class Session:
     period = PERIOD
 
     def __init__(
-        self, robot: Robot, controllers: Sequence[str] = ("rmp_vices",), scene="free"
+        self,
+        robot: Robot,
+        controllers: Sequence[str] = ("rmp_vices",),
+        scene: str = "free",
+        objects: Objects = NONE,
     ):
         """Build the model; nothing is compiled before the first step.
+
+        Args:
+            robot: The arm.
+            controllers: Who drives: one arm for each.
+            scene: Things to begin with.
+            objects: A task's, which physics moves; each arm has its own.
 
         Raises:
             ValueError: Unknown controller or scene.
         """
-        self.robot = robot
-        self.model = physics.build(robot, PERIOD)
+        self.robot, self.objects = robot, objects
+        self.model = physics.build(robot, PERIOD, objects)
+        self._slots = objects.slots(self.model)
+        self._work = frozenset(self.model.geom(name).id for name in objects.touch)
         self.base = {name: make(name, robot, PERIOD) for name in CONTROLLERS}
         self.dials: dict[str, Dials] = {n: dials(c) for n, c in self.base.items()}
         self.stiffness = {"kp_pos": KP, "kp_ori": KP}
@@ -105,13 +116,14 @@ class Session:
         self.history: collections.deque[Frame] = collections.deque(maxlen=kept(PERIOD))
         self._control = jax.jit(functools.partial(control, self.base))
         self._think = {
-            n: jax.jit(functools.partial(_thought, self.base[n])) for n in _TREES
+            n: jax.jit(functools.partial(thought, self.base[n])) for n in _TREES
         }
         self.time = 0.0
         self.arms: list[mujoco.MjData] = []
         self.controllers: tuple[str, ...] = ()
-        self.start(controllers)
         self.load(scene)
+        self.set_floor(objects is not NONE)
+        self.start(controllers)
 
     def start(self, controllers: Sequence[str] | None = None) -> None:
         """Put every arm at home and forget the history.
@@ -143,7 +155,7 @@ class Session:
         first = self.arms[0]
         self.arms = self.arms[: len(controllers)]
         while len(self.arms) < len(controllers):
-            self.arms.append(self._at_home(first.qpos, first.qvel))
+            self.arms.append(self._at(first.qpos, first.qvel))
         self.controllers = tuple(controllers)
 
     def load(self, scene: str) -> None:
@@ -170,18 +182,17 @@ class Session:
         self.things = tuple(things)
         physics.resize(self.model, self.things, self.floor)
 
-    def set_floor(self, height: float | None) -> None:
-        """Put a floor at a height [m]; None: take it away."""
-        self.floor = height
+    def set_floor(self, there: bool) -> None:
+        """Put the floor in at its height, or take it away."""
+        self.floor = self.objects.floor if there else None
         physics.resize(self.model, self.things, self.floor)
 
     def step(self) -> Frame:
         """One control and physics step of every arm."""
         began = time.perf_counter()
         self.things = tuple(thing.moved(PERIOD) for thing in self.things)
-        around = self._around(self.things)
         numbers = tuple(
-            self._step_one(data, name, around)
+            self._step_one(data, name)
             for data, name in zip(self.arms, self.controllers, strict=True)
         )
         self.time += PERIOD
@@ -192,14 +203,14 @@ class Session:
         self.history.append(frame)
         return frame
 
-    def _step_one(self, data: mujoco.MjData, name: str, around: Any) -> Numbers:
-        tau_ext = physics.contact_torque(self.model, data) + self._push(data)
-        q, qd = data.qpos.copy(), data.qvel.copy()
+    def _step_one(self, data: mujoco.MjData, name: str) -> Numbers:
+        n, model = self.robot.n, self.model
+        tau_ext = (physics.contact_torque(model, data) + self._push(data))[:n]
+        around = self._around(self.things, self.objects.read(model, data))
         out = self._control(
             np.int32(list(CONTROLLERS).index(name)),
             self._packed(),
-            *_single(q, qd),
-            *_single(*self.target),
+            *_single(data.qpos[:n], data.qvel[:n], *self.target),
             self._gains(),
             np.float32(self.time),
             around,
@@ -208,16 +219,17 @@ class Session:
         tau, qdd, clearance = (np.asarray(x, float) for x in out)
         data.ctrl[:] = tau
         physics.place(self.model, data, self.things)
-        mujoco.mj_step(self.model, data)
-        force = physics.contact_force(self.model, data)
+        mujoco.mj_step(model, data)
         return Numbers(
-            data.qpos.copy(),
-            data.qvel.copy(),
+            data.qpos[:n].copy(),
+            data.qvel[:n].copy(),
             qdd,
             tau,
             tau_ext,
             float(clearance),
-            force,
+            physics.contact_force(model, data, self._work),
+            (data.qpos[n:].copy(), data.qvel[n:].copy()),
+            self.objects.read(model, data),
         )
 
     def think(self, frame: Frame, arm: int = 0) -> Insight:
@@ -234,7 +246,7 @@ class Session:
                 *_single(now.q, now.qd, now.qdd, *frame.target),
                 self._gains(),
                 np.float32(frame.time),
-                self._around(frame.things),
+                self._around(frame.things, now.objects),
                 *_single(now.tau_ext),
             )
         )
@@ -252,7 +264,10 @@ class Session:
             self.history.pop()
         self.time, self.controllers = frame.time, frame.controllers
         self.target = frame.target
-        self.arms = [self._at_home(arm.q, arm.qd) for arm in frame.arms]
+        self.arms = [
+            self._at([*arm.q, *arm.rest[0]], [*arm.qd, *arm.rest[1]])
+            for arm in frame.arms
+        ]
         self.set_things(frame.things)
 
     def hand(self, arm: int = 0) -> np.ndarray:
@@ -278,10 +293,12 @@ class Session:
         if not names:
             raise ValueError("there must be at least one controller")
 
-    def _at_home(self, q: Any = None, qd: Any = None) -> mujoco.MjData:
+    def _at_home(self) -> mujoco.MjData:
+        return self._at([*self.robot.q_home, *self.objects.qpos], 0.0)
+
+    def _at(self, qpos: ArrayLike, qvel: ArrayLike) -> mujoco.MjData:
         data = mujoco.MjData(self.model)
-        data.qpos[:] = self.robot.q_home if q is None else q
-        data.qvel[:] = 0.0 if qd is None else qd
+        data.qpos[:], data.qvel[:] = qpos, qvel
         physics.place(self.model, data, self.things)
         mujoco.mj_forward(self.model, data)
         return data
@@ -302,74 +319,20 @@ class Session:
         """The dials' values: few arrays are quicker to hand over than many numbers."""
         return {n: np.array([*d.values()], np.float32) for n, d in self.dials.items()}
 
-    def _around(self, things: tuple[Thing, ...]) -> Obstacles:
-        """The things as obstacles, made anew only when they change."""
-        key = things, self.floor
+    def _around(
+        self, things: tuple[Thing, ...], objects: tuple[Thing, ...]
+    ) -> Obstacles:
+        """Things and objects as obstacles, made anew only when they change."""
+        key = things, objects, self.floor
         if self._made is None or self._made[0] != key:
-            self._made = key, jax.device_put(obstacles(things, self.floor))
+            found = obstacles([*things, *objects], self.floor, self._slots)
+            self._made = key, jax.device_put(found)
         return self._made[1]
 
     def _gains(self) -> tuple[np.float32, np.float32]:
         return np.float32(self.stiffness["kp_pos"]), np.float32(
             self.stiffness["kp_ori"]
         )
-
-
-def lead(robot: Robot, q: Any, p: Any, wxyz: Any, gains: Any, at: Any) -> Setpoint:
-    """The set-point on the way to a target, at most `LEAD` ahead of the hand."""
-    here, R = site_pose(robot, q)
-    R_target = quat_to_mat(wxyz)
-    turn = log_so3(jnp.matmul(R_target, R.T, precision="highest"))
-    ahead, turn = (
-        x * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(x), 1e-9))
-        for x, most in zip((p - here, turn), LEAD, strict=True)
-    )
-    kp_pos, kp_ori = (jnp.full(3, kp) for kp in gains)
-    R_des = jnp.matmul(exp_so3(turn), R, precision="highest")
-    return Setpoint(here + ahead, R_des, kp_pos, kp_ori, at)
-
-
-def control(
-    base: dict[str, Any],
-    index: Any,
-    values: dict[str, Any],
-    q,
-    qd,
-    p,
-    wxyz,
-    gains,
-    at,
-    around,
-    tau_ext,
-    tau_last,
-) -> tuple[Any, Any, Any]:
-    """Torque, acceleration and clearance of any of the controllers, by its index."""
-    robot = next(iter(base.values())).robot
-    setpoint = lead(robot, q, p, wxyz, gains, at)
-
-    def branch(name: str):
-        def run():
-            out = turned(base[name], named(base[name], values[name]))(
-                q, qd, setpoint, around, tau_ext, tau_last
-            )
-            return out.tau, out.qdd
-
-        return run
-
-    tau, qdd = jax.lax.switch(index, [branch(name) for name in base])
-    points = point_state(robot, arm_state(robot, q, qd))
-    nearest = [
-        jnp.min(jnp.where(gap.active, gap.distance, jnp.inf))
-        for gap in obstacle_gaps(robot, points, around).values()
-    ]
-    return tau, qdd, jnp.min(jnp.stack(nearest))
-
-
-def _thought(base, values, q, qd, qdd, p, wxyz, gains, at, around, tau_ext) -> Insight:
-    setpoint = lead(base.robot, q, p, wxyz, gains, at)
-    return think(
-        turned(base, named(base, values)), q, qd, qdd, setpoint, around, tau_ext
-    )
 
 
 def _single(*arrays: Any) -> list[np.ndarray]:

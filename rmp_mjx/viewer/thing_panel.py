@@ -31,7 +31,8 @@ class ThingPanel:
         self.scene = gui.add_dropdown(
             "Scene", list(SCENES), initial_value=page.session.scene
         )
-        self.floor = gui.add_checkbox("Floor at the base", False)
+        there = page.session.floor is not None
+        self.floor = gui.add_checkbox("Floor", there)
         self.add = {kind: gui.add_button(f"Add {kind}") for kind in SLOTS}
         self.which = gui.add_slider("Thing number", 1, sum(SLOTS.values()), 1, 1)
         self.size = gui.add_vector3(
@@ -47,9 +48,7 @@ class ThingPanel:
         session = page.session
         self.scene.on_update(lambda _: page.order(self._load))
         self.floor.on_update(
-            lambda _: page.order(
-                lambda: session.set_floor(0.0 if self.floor.value else None)
-            )
+            lambda _: page.order(lambda: session.set_floor(self.floor.value))
         )
         for kind, button in self.add.items():
             button.on_click(lambda _, kind=kind: page.order(lambda: self._add(kind)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -35,6 +35,10 @@ class Thing:
     """World frame [m/s]."""
     place: tuple[float, ...] | None = None
     """Where it was put [m]; None: at `position`."""
+    spin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Angular velocity, world frame [rad/s]."""
+    hand_may_touch: bool = False
+    """Whether the hand need not avoid it."""
 
     def __post_init__(self):
         """Check the numbers.
@@ -49,7 +53,7 @@ class Thing:
             raise ValueError(
                 f"a {self.kind} has {wanted} positive sizes [m], got {self.size}"
             )
-        for name in ("position", "wxyz", "velocity"):
+        for name in ("position", "wxyz", "velocity", "spin"):
             if not np.all(np.isfinite(getattr(self, name))):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
 
@@ -88,17 +92,20 @@ class Thing:
         return matrix.reshape(3, 3)
 
 
-def obstacles(things: Sequence[Thing], floor: float | None) -> Obstacles:
-    """The same as obstacles of a controller, float32, in `SLOTS` and one plane.
+def obstacles(
+    things: Sequence[Thing], floor: float | None, slots: Mapping[str, int] = SLOTS
+) -> Obstacles:
+    """The same as obstacles of a controller, float32, in slots and one plane.
 
     Args:
         things: The things.
         floor: Height of the floor [m]; None: there is none.
+        slots: Number of obstacles of each kind, in use or not.
     """
-    kinds = {kind: [t for t in things if t.kind == kind] for kind in SLOTS}
+    kinds = {kind: [t for t in things if t.kind == kind] for kind in slots}
 
     def rows(kind: str, values: Sequence, default: Sequence[float]) -> np.ndarray:
-        full = np.tile(np.asarray(default, np.float32), (SLOTS[kind], 1))
+        full = np.tile(np.asarray(default, np.float32), (slots[kind], 1))
         if values:
             full[: len(values)] = values
         return full
@@ -107,15 +114,19 @@ def obstacles(things: Sequence[Thing], floor: float | None) -> Obstacles:
         return {
             "velocity": rows(kind, [t.velocity for t in kinds[kind]], [0.0] * 3),
             "center": rows(kind, [t.position for t in kinds[kind]], [0.0] * 3),
-            "hand_may_touch": np.zeros(SLOTS[kind], bool),
-            "active": np.arange(SLOTS[kind]) < len(kinds[kind]),
+            "hand_may_touch": rows(
+                kind, [(t.hand_may_touch,) for t in kinds[kind]], [0.0]
+            )[:, 0].astype(bool),
+            "active": np.arange(slots[kind]) < len(kinds[kind]),
         }
 
     def radius(kind: str) -> np.ndarray:
         return rows(kind, [t.size[:1] for t in kinds[kind]], [1.0])[:, 0]
 
-    still = {kind: np.zeros((SLOTS[kind], 3), np.float32) for kind in SLOTS}
-    turned = np.tile(np.eye(3, dtype=np.float32), (SLOTS["box"], 1, 1))
+    def spin(kind: str) -> np.ndarray:
+        return rows(kind, [t.spin for t in kinds[kind]], [0.0] * 3)
+
+    turned = np.tile(np.eye(3, dtype=np.float32), (slots["box"], 1, 1))
     for k, thing in enumerate(kinds["box"]):
         turned[k] = thing.rotation
     return Obstacles(
@@ -135,14 +146,14 @@ def obstacles(things: Sequence[Thing], floor: float | None) -> Obstacles:
                 :, 0
             ],
             radius=radius("capsule"),
-            angular_velocity=still["capsule"],
+            angular_velocity=spin("capsule"),
             **common("capsule"),
         ),
         boxes=Boxes(
             rotation=turned,
             half_size=rows("box", [t.size for t in kinds["box"]], [1.0] * 3),
-            radius=np.zeros(SLOTS["box"], np.float32),
-            angular_velocity=still["box"],
+            radius=np.zeros(slots["box"], np.float32),
+            angular_velocity=spin("box"),
             **common("box"),
         ),
     )

@@ -22,7 +22,7 @@ def shared_session(jaco):
 @pytest.fixture
 def session(shared_session):
     """The shared one, as new."""
-    shared_session.set_floor(None)
+    shared_session.set_floor(False)
     shared_session.load("free")
     shared_session.push = None
     shared_session.stiffness.update(kp_pos=150.0, kp_ori=150.0)
