@@ -113,7 +113,14 @@ class Page(Stage):
         server = self.server
         server.initial_camera.position = EYE
         server.initial_camera.look_at = MIDDLE
-        server.scene.add_grid("/grid", 4.0, 4.0, cell_size=0.1, section_size=0.5)
+        server.scene.add_grid(
+            "/grid",
+            4.0,
+            4.0,
+            cell_size=0.1,
+            section_size=0.5,
+            position=(0.0, 0.0, self.session.objects.floor),
+        )
         self._arms: list[drawing.Bodies] = []
         self._fit_arms(1)
         robot, model = self.session.robot, self.session.model

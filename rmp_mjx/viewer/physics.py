@@ -101,8 +101,8 @@ def contact_force(
         work: Geoms that the hand may touch, by id; their contacts are left out.
     """
     wrench, total = np.zeros(6), 0.0
-    for k, contact in enumerate(data.contact):
-        if work.isdisjoint(contact.geom):
+    for k, pair in enumerate(data.contact.geom if data.ncon else ()):
+        if work.isdisjoint(pair):
             mujoco.mj_contactForce(model, data, k, wrench)
             total += wrench[0]
     return total
