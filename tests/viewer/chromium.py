@@ -129,6 +129,11 @@ class Tab:
     def click(self, name, role="button"):
         self.window.get_by_role(role, name=name, exact=True).first.click()
 
+    def press(self, name):
+        """Click a button, but without the mouse: it waits for two pictures alike."""
+        found = self.window.get_by_role("button", name=name, exact=True).first
+        found.dispatch_event("click")
+
     def choose(self, label, option):
         self.window.get_by_label(label, exact=True).first.click()
         self.window.get_by_role("option", name=option, exact=True).first.click()

@@ -34,6 +34,7 @@ def tabs(browser, page):
 def page(session, tmp_path):
     session.step()  # compiled before the clock runs
     page = Page(session, "jaco2", port=8710, folder=tmp_path)
+    page.server.scene.configure_default_lights(cast_shadow=False)
     with chromium.running(page):
         yield page
 
@@ -57,7 +58,7 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
     before, hand = tab.picture(), session.hand()
     assert before.std() > 5.0  # there is something to see
 
-    tab.click("Record")
+    tab.press("Record")
     start = session.target[0]
     tab.drag(start, np.array([0.0, 1.0, 0.0]), 0.2)
     chromium.wait(lambda: session.target[0][1] > start[1] + 0.1, "the target moved")
@@ -71,7 +72,7 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
     assert changed.mean() > 0.01, "the pictures are the same"
 
     tab.click("Things", "tab")
-    tab.click("Add sphere")
+    tab.press("Add sphere")
     chromium.wait(lambda: len(session.things) == 1, "a sphere")
     chromium.wait(lambda: np.isfinite(_arm(page).clearance), "a clearance")
     ahead = session.target[0] + np.array([0.0, 0.02, 0.12])
@@ -85,7 +86,7 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
     chromium.wait(lambda: _arm(page).force > 1.0, "VICES hits the sphere")
     assert not page.player.paused and page.player.pace > 0.5
 
-    tab.click("Stop and save")
+    tab.press("Stop and save")
     chromium.wait(lambda: list(tmp_path.glob("*.html")) != [], "a recording")
     assert tab.faults == []
 
@@ -100,11 +101,11 @@ def test_the_arm_follows_avoids_and_hits_as_its_users_order(tabs, page, tmp_path
 @needs_chromium
 def test_two_tabs_show_the_same_through_a_reload_and_an_end(tabs, page):
     first, second = tabs(), tabs()
-    first.click("Pause")
+    first.press("Pause")
     chromium.wait(lambda: page.player.paused, "a pause")
     second.window.get_by_role("button", name="Go on", exact=True).first.wait_for()
     first.window.reload()
-    first.window.get_by_role("button", name="Go on", exact=True).first.click()
+    first.press("Go on")
     chromium.wait(lambda: not page.player.paused, "the end of the pause")
     second.window.wait_for_timeout(300)
     assert first.faults == [] == second.faults
