@@ -209,9 +209,9 @@ def attack(robot, guard, count, steps, seed, on=True):
 
 
 def test_a_guarded_arm_is_slow_at_every_contact(robot, guard):
-    """The induction step, 60,000 times, against torques that know no obstacle."""
-    arms, sums = attack(robot, guard, count=24, steps=2500, seed=0)
-    assert len(arms.hits) > 20  # the spheres do get there
+    """The induction step, 24,000 times, against torques that know no obstacle."""
+    arms, sums = attack(robot, guard, count=24, steps=1000, seed=0)
+    assert len(arms.hits) > 10  # the spheres do get there
     assert max(arms.hits) <= guard.speed
     assert arms.limits == 0
     assert sums["unproved"] == 0

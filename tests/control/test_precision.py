@@ -46,7 +46,7 @@ def test_float32_is_close_to_float64_with_obstacles_near(
     assert np.mean(clearances < 0.05) > 0.5
 
 
-def test_torque_is_finite_and_within_limits_in_100_000_hard_states(
+def test_torque_is_finite_and_within_limits_in_20_000_hard_states(
     run32, ctrl, robot, states, obstacles
 ):
     """Overlapping obstacles, joints far beyond their limits, broken actions."""
@@ -54,7 +54,7 @@ def test_torque_is_finite_and_within_limits_in_100_000_hard_states(
     scenes = [obstacles(seed, scale=0.15, speed=3.0) for seed in range(4)]
     broken = np.array([np.nan, np.inf, -np.inf, 1e30])
     overlapping = 0
-    for k in range(200):
+    for k in range(40):
         q, qd, action = states(100 + k, reach=5.0, speed=4.0)
         bad = rng.random(action.shape) < 0.05
         action = np.where(bad, rng.choice(broken, action.shape), action)
@@ -64,7 +64,7 @@ def test_torque_is_finite_and_within_limits_in_100_000_hard_states(
         at_limit = np.abs(out.tau) == np.float32(robot.tau_max)
         assert np.array_equal(out.diagnostics["torque_limit"] != 0.0, at_limit)
         overlapping += np.sum(out.diagnostics["clearance"] < 0.0)
-    assert overlapping > 10_000
+    assert overlapping > 2_000
 
 
 STRAIGHT = np.array([0.0, np.pi, 0.0, np.pi, 0.0, np.pi, 0.0])
