@@ -117,7 +117,8 @@ def pareto(place: Store, path: Path) -> None:
     with _figure(path, len(TABLE), len(TASKS), (3.8, 3.0)) as (_, axes):
         for line, name in enumerate(TABLE):
             for axis, (task, title) in zip(axes[line], TASKS.items(), strict=True):
-                for variant, style in VARIANTS.items():
+                sizes = np.linspace(10.0, 4.0, len(VARIANTS))  # none hides another
+                for (variant, style), size in zip(VARIANTS.items(), sizes, strict=True):
                     rows = targets.best(place, task, variant, name)
                     if rows is None:
                         continue
@@ -126,6 +127,7 @@ def pareto(place: Store, path: Path) -> None:
                     axis.errorbar(
                         *(x, y, dy, dx),
                         fmt="o",
+                        markersize=size,
                         color=style.color,
                         capsize=2,
                         lw=1,
