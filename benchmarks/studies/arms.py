@@ -11,6 +11,7 @@ as ``python -m benchmarks.arms --json FILE --docs docs/results/arms.md``.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -145,7 +146,12 @@ def table(task: str, rows: Sequence[Row]) -> str:
 def main(argv: list[str] | None = None) -> None:
     """Measure, print, and write the requested files."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", nargs="+", default=list(envs.names()))
+    parser.add_argument(
+        "--parts",
+        nargs="+",
+        default=["random", *envs.names()],
+        help="of the whole; the others are kept as they are in the JSON file",
+    )
     parser.add_argument("--policies", type=Path, default=ROOT / "pretrained")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=7000)
@@ -154,15 +160,25 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--docs", type=Path)
     args = parser.parse_args(argv)
     runtime.configure(split_cpu=True)
-    rows = under_random_policies(args.quick)
-    for task in args.tasks:
-        rows += measure(task, args.policies, args.episodes, args.seed)
-        show(rows, task)
+    known: list[Row] = []
+    if args.json and args.json.is_file():
+        known = [Row(**row) for row in json.loads(args.json.read_text())["rows"]]
+    for part in args.parts:
+        known = [row for row in known if not row.key.startswith(f"{part}/")]
+        if part == "random":
+            new = under_random_policies(args.quick)
+        else:
+            new = measure(part, args.policies, args.episodes, args.seed)
+        show(new, part)
+        known += new
         if args.json:
             settings = {"episodes": args.episodes, "seed": args.seed}
-            write_json(args.json, rows, **settings)
-    matrix = "\n\n".join(table(task, rows) for task in args.tasks)
-    tables = {"random": random_table(rows), "arms": matrix}
+            write_json(args.json, known, **settings)
+    there = {row.key.split("/")[0] for row in known}
+    tasks = [task for task in envs.names() if task in there]
+    tables = {"arms": "\n\n".join(table(task, known) for task in tasks)}
+    if "random" in there:
+        tables["random"] = random_table(known)
     print(*tables.values(), sep="\n\n")
     if args.docs:
         args.docs.write_text(insert(args.docs.read_text(), tables))
