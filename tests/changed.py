@@ -23,15 +23,15 @@ OTHERS = {
     "control/tree": "control/test_tree_equivalence",
     "control/vices": "control/test_vices control/test_controller",
     "robot/control_points": "robot/test_control_points robot/test_model",
-    "robot/dynamics": "robot/test_dynamics robot/test_motors robot/test_bounds",
+    "robot/dynamics": "robot/test_dynamics robot/test_passive_forces robot/test_bounds",
     "robot/errors": "robot/test_model robot/test_mjcf",
     "robot/fingerprint": "robot/test_model",
     "robot/kinematics": "robot/test_kinematics robot/test_model",
     "robot/limits": "robot/test_model robot/test_mjcf robot/test_library",
     "robot/links": "robot/test_model robot/test_mjcf",
     "robot/model": "robot/test_model robot/test_dynamics",
-    "robot/mjcf": "robot/test_mjcf robot/test_model robot/test_motors",
-    "robot/motors": "robot/test_motors robot/test_mjcf",
+    "robot/mjcf": "robot/test_mjcf robot/test_model robot/test_passive_forces",
+    "robot/motors": "robot/test_motors robot/test_passive_forces",
     "robot/point_state": "control/test_avoidance control/test_tree_equivalence",
 }
 """Tests of the modules without a test file of their own name, or with more than it."""

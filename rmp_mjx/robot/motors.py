@@ -52,10 +52,11 @@ def make_motors(
         for name in joints:  # else the simulation would still apply the file's
             if model.jnt_actfrclimited[model.joint(name).id]:
                 spec.joint(name).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    order = [a.id for group in groups for a in group]
-    if order == list(range(len(joints))) and all(
-        len(group) == 1 and _is_motor(model, group[0], limit)
+    ids = [[a.id for a in group] for group in groups]
+    if ids == [[k] for k in range(len(joints))] and all(
+        _is_motor(model, a, limit)
         for group, limit in zip(groups, limits, strict=True)
+        for a in group
     ):
         return
     names = [group[0].name if len(group) == 1 else "" for group in groups]
@@ -100,16 +101,15 @@ def _is_motor(
 
 def _kind(model: mujoco.MjModel, a: int) -> str:
     """What MJCF calls an actuator like this one."""
-    bias, gain = model.actuator_biastype[a], model.actuator_gaintype[a]
-    if gain != mujoco.mjtGain.mjGAIN_FIXED:
-        return "general"
-    if bias == mujoco.mjtBias.mjBIAS_NONE:
-        return "motor"
-    if bias == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[a, 1]:
-        return "position"
-    if bias == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[a, 2]:
-        return "velocity"
-    return "general"
+    gain, bias = mujoco.mjtGain, mujoco.mjtBias
+    _, place, speed = model.actuator_biasprm[a, :3]
+    feedback = "position" if place else "velocity" if speed else "general"
+    kinds = {
+        (gain.mjGAIN_FIXED, bias.mjBIAS_NONE): "motor",
+        (gain.mjGAIN_FIXED, bias.mjBIAS_AFFINE): feedback,
+    }
+    own = gain(model.actuator_gaintype[a]), bias(model.actuator_biastype[a])
+    return kinds.get(own, "general")
 
 
 def _limit(
@@ -122,7 +122,7 @@ def _limit(
     joint_id = model.joint(joint).id
     if not group and model.jnt_actfrclimited[joint_id]:
         limit = float(min(abs(model.jnt_actfrcrange[joint_id])))
-        if limit > 0:
+        if limit:
             return limit
     if len(group) != 1:
         names = f" ({', '.join(repr(a.name) for a in group)})" if group else ""
@@ -130,7 +130,8 @@ def _limit(
             f"joint '{joint}' has {len(group)} actuators{names}: it needs one "
             "actuator, or pass torque_limits="
         )
-    a, name = group[0].id, group[0].name or f"on joint {joint}"
+    (actuator,) = group
+    a, name = actuator.id, actuator.name or f"on joint {joint}"
     kind, gear = _kind(model, a), model.actuator_gear[a, 0]
     ranges = []
     if model.actuator_forcelimited[a]:
@@ -172,9 +173,9 @@ def _move_losses_to_joints(
     for name, group in zip(joints, groups, strict=True):
         joint = spec.joint(name)
         for actuator in group:
-            gear = abs(model.actuator_gear[actuator.id, 0])
-            joint.armature = joint.armature + actuator.armature * gear**2
-            reflected = np.asarray(actuator.damping) * gear ** np.array([2, 3, 4])
+            square = model.actuator_gear[actuator.id, 0] ** 2
+            joint.armature = joint.armature + square * actuator.armature
+            reflected = square * np.asarray(actuator.damping)
             joint.damping = np.asarray(joint.damping) + reflected
 
 
@@ -207,8 +208,7 @@ def passive_forces(model: mujoco.MjModel, joints: Sequence[str]) -> PassiveForce
         "dry friction (frictionloss), which cannot be compensated exactly: expect the "
         "arm to stop short of its target by friction over stiffness",
     )
-    curved = np.abs(model.dof_dampingpoly[dofs]).sum(1)
-    curved = curved + np.abs(model.jnt_stiffnesspoly[ids]).sum(1)
+    curved = model.dof_dampingpoly[dofs].any(1) | model.jnt_stiffnesspoly[ids].any(1)
     _warn(
         joints,
         curved,

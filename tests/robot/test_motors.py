@@ -1,15 +1,10 @@
 """Whatever actuators a file has, the robot's own model has one torque motor a joint."""
 
-import functools
-import warnings
-
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from rmp_mjx import RMPVICES, VICES, Action, Obstacles, Robot, RobotError, RobotWarning
+from rmp_mjx import Robot, RobotError, RobotWarning
 
 ARM = """<mujoco><compiler angle="radian"/><option gravity="0 0 0"/>
 <default><general ctrlrange="-1 1" gear="7" biastype="affine" biasprm="0 -3 -2"/>
@@ -84,9 +79,55 @@ ACCEPTED = {
         '<motor name="s" jointinparent="b" gear="1" ctrlrange="-4 4"/>',
         4.0,
     ),
+    "gain that a force range undoes": (
+        '<general name="s" joint="b" gainprm="2" biastype="none" gear="1" '
+        'ctrlrange="-4 4" forcerange="-4 4"/>',
+        4.0,
+    ),
+    "gear that a force range undoes": (
+        '<motor name="s" joint="b" gear="2" ctrlrange="-4 4" forcerange="-2 2"/>',
+        4.0,
+    ),
+    "control without a range": (
+        '<motor name="s" joint="b" gear="1" ctrllimited="false" ctrlrange="-4 4" '
+        'forcerange="-4 4"/>',
+        4.0,
+    ),
+    "uneven the other way": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="-9 4"/>',
+        4.0,
+    ),
+    "position with a gain of 1": (
+        '<position name="s" joint="b" kp="1" gear="1" ctrlrange="-6 6" '
+        'forcerange="-6 6"/>',
+        6.0,
+    ),
+    "weak position": (
+        '<position name="s" joint="b" kp="2" gear="1" forcerange="-6 6"/>',
+        6.0,
+    ),
+    "weak gain by position": (
+        '<general name="s" joint="b" gaintype="affine" gainprm="1 .5" biastype="none" '
+        'gear="1" dyntype="filter" dynprm=".1" forcerange="-6 6"/>',
+        6.0,
+    ),
+    "rotor inertia": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="-4 4" armature=".1"/>',
+        4.0,
+    ),
+    "damping": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="-4 4" damping=".1"/>',
+        4.0,
+    ),
+    "delay": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="-4 4" nsample="3" '
+        'delay=".004"/>',
+        4.0,
+    ),
 }
 
 
+@pytest.mark.filterwarnings("error::rmp_mjx.RobotWarning")
 @pytest.mark.parametrize(("text", "limit"), ACCEPTED.values(), ids=ACCEPTED.keys())
 def test_control_is_torque_up_to_the_limit(text, limit):
     robot = arm(text)
@@ -114,6 +155,33 @@ def test_the_joint_may_limit_a_position_actuator():
         joint='actuatorfrcrange="-2 2"',
     )
     assert robot.tau_max.tolist() == [5.0, 2.0]
+
+
+@pytest.mark.parametrize(("own", "limit"), [(3, 3.0), (6, 4.0)])
+def test_the_narrower_of_two_limits_counts(own, limit):
+    motor = '<motor name="s" joint="b" gear="1" ctrlrange="-4 4"/>'
+    robot = arm(motor, joint=f'actuatorfrcrange="-{own} {own}"')
+    assert robot.tau_max.tolist() == [5.0, limit]
+
+
+def test_a_joint_without_an_actuator_may_have_a_limit_of_its_own():
+    robot = arm("", joint='actuatorfrcrange="-2 3"')
+    assert robot.tau_max.tolist() == [5.0, 2.0]
+    with pytest.raises(RobotError, match="joint 'b' has 0 actuators: it needs one"):
+        arm("", joint='actuatorfrcrange="0 3"')
+
+
+def test_two_actuators_of_one_joint_are_not_one_of_each():
+    """They stand in their order, with the limits given: neither is the other's."""
+    second = '<motor name="s" joint="b" gear="1" ctrlrange="-7 7"/>'
+    for first in (FIRST, FIRST.replace('joint="a"', 'joint="b"')):
+        third = second.replace('"s"', '"t"')
+        robot = arm(second + third, first=first, torque_limits=[5.0, 7.0])
+        assert robot.mj_model.nu == 2
+        np.testing.assert_array_equal(applied(robot, [99, -99]), [5.0, -7.0])
+    robot = arm(second + third, torque_limits=[5.0, 7.0])
+    names = [robot.mj_model.actuator(k).name for k in range(2)]
+    assert names == ["first", ""]
 
 
 @pytest.mark.parametrize(
@@ -162,6 +230,24 @@ def test_rotor_inertia_and_damping_of_an_actuator_pass_to_its_joint():
     np.testing.assert_allclose(inertia[1], inertia[0], rtol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:.*polynomial:rmp_mjx.RobotWarning")
+@pytest.mark.parametrize("gear", [2.0, -3.0])
+def test_an_actuators_damping_slows_the_arm_as_before(gear):
+    """Linear, square and cubic, by MuJoCo C; the arm's text has six digits."""
+    text = (
+        f'<motor name="s" joint="b" gear="{gear}" ctrlrange="-6 6" '
+        'damping=".25 .5 .125"/>'
+    )
+    robot, slowed = arm(text, joint='damping="1 .1 .2"'), []
+    original = ARM.format(actuators=FIRST + text, joint='damping="1 .1 .2"')
+    for model in (mujoco.MjModel.from_xml_string(original), robot.mj_model):
+        data = mujoco.MjData(model)
+        data.qvel[:] = 0.7, -0.6
+        mujoco.mj_forward(model, data)
+        slowed.append(data.qacc.copy())
+    np.testing.assert_allclose(slowed[1], slowed[0], rtol=1e-5)
+
+
 def test_a_motor_with_dynamics_loses_them_with_a_warning():
     text = (
         '<general name="s" joint="b" gear="1" biastype="none" dyntype="filter" '
@@ -182,6 +268,28 @@ REFUSED = {
         '<velocity name="s" joint="b" kv="9"/>',
         "actuator 's' is a velocity actuator without forcerange",
     ),
+    "general without a force range": (
+        '<general name="s" joint="b" gaintype="affine" gainprm="1 .5" '
+        'biastype="none"/>',
+        "actuator 's' is a general actuator without forcerange",
+    ),
+    "motor without a range": (
+        '<motor name="s" joint="b" gear="1" ctrllimited="false"/>',
+        "actuator 's' is a motor without ctrlrange or forcerange",
+    ),
+    "motor without a name": (
+        '<motor joint="b" gear="1" ctrllimited="false"/>',
+        "actuator 'on joint b' is a motor without",
+    ),
+    "none": ("", "joint 'b' has 0 actuators: it needs one"),
+    "one way and never still": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="1 4"/>',
+        r"actuator 's' cannot push both ways: its torque range is \[1, 4\]",
+    ),
+    "the other way": (
+        '<motor name="s" joint="b" gear="1" ctrlrange="-4 -1"/>',
+        r"actuator 's' cannot push both ways: its torque range is \[-4, -1\]",
+    ),
     "one way": (
         '<motor name="s" joint="b" gear="1" ctrlrange="0 4"/>',
         r"actuator 's' cannot push both ways: its torque range is \[0, 4\]",
@@ -198,118 +306,3 @@ REFUSED = {
 def test_a_refusal_says_which_actuator_and_what_it_needs(text, message):
     with pytest.raises(RobotError, match=message):
         arm(text)
-
-
-JOINTS = {
-    "a": 'damping="3" stiffness="20" springref="0.4"',
-    "b": 'type="slide" damping="40"',
-    "c": 'stiffness="5" springref="-0.2" ref="0.1"',
-}
-
-
-def text(**joints):
-    a, b, c = (f'name="{k}" {(JOINTS | joints)[k]}' for k in "abc")
-    return f"""<mujoco><compiler angle="radian"/><worldbody><body name="one">
-    <joint {a} axis="0 1 0" range="-2 2" armature=".05"/>
-    <geom name="one" type="capsule" fromto="0 0 0 0 0 .3" size=".04"/>
-    <body name="two" pos="0 0 .3"><joint {b} axis="1 0 0" range="-.3 .3"/>
-    <geom name="two" type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
-    <body name="three" pos=".3 0 0"><joint {c} axis="0 0 1" armature=".02"/>
-    <geom name="three" type="capsule" fromto="0 0 0 0 .2 0" size=".03"/>
-    <site name="tip" pos="0 .2 0"/></body></body></body></worldbody><actuator>
-    <motor joint="a" ctrlrange="-90 90"/><motor joint="b" ctrlrange="-90 90"/>
-    <motor joint="c" ctrlrange="-90 90"/></actuator></mujoco>"""
-
-
-@pytest.fixture(scope="module")
-def sprung():
-    """A hinge with both, a slide with a damper, a hinge with a spring and a ref."""
-    return Robot.from_mjcf(text(), site="tip", spacing=0.1)
-
-
-def test_bias_balances_mujocos_passive_forces(sprung, ours):
-    """qfrc_bias - qfrc_passive in 50 states, float64; 1e-11 of 100 N m."""
-    rng = np.random.default_rng(0)
-    q, qd = rng.uniform(-2, 2, (50, 3)), rng.normal(scale=2.0, size=(50, 3))
-    bias = ours(sprung, q, qd)[0].bias
-    model = sprung.mj_model
-    data = mujoco.MjData(model)
-    for k in range(50):
-        data.qpos[:], data.qvel[:] = q[k], qd[k]
-        mujoco.mj_forward(model, data)
-        assert np.abs(data.qfrc_passive).min() > 0.0
-        expected = data.qfrc_bias - data.qfrc_passive
-        np.testing.assert_allclose(bias[k], expected, rtol=0.0, atol=1e-11)
-
-
-def test_it_is_a_choice(sprung, ours):
-    """Without it the bias is MuJoCo's qfrc_bias alone."""
-    robot = Robot.from_mjcf(text(), site="tip", spacing=0.1, compensate_passive=False)
-    assert robot.damping is None and robot.stiffness is None
-    q, qd = np.full((1, 3), 0.3), np.full((1, 3), 0.5)
-    data = mujoco.MjData(robot.mj_model)
-    data.qpos[:], data.qvel[:] = q[0], qd[0]
-    mujoco.mj_forward(robot.mj_model, data)
-    bias = ours(robot, q, qd)[0].bias[0]
-    np.testing.assert_allclose(bias, data.qfrc_bias, rtol=0.0, atol=1e-11)
-
-
-@pytest.mark.parametrize("controller", [RMPVICES, functools.partial(VICES, kq=0.0)])
-def test_every_controller_gives_the_passive_forces_on_top(sprung, controller):
-    """The torque differs by damping and springs; 1e-4 of 100 N m, in float32. Three
-    joints cannot do all that VICES asks of a hand, and its solves would multiply the
-    rounding. So no orientation is held, and no posture."""
-    bare = sprung.replace(damping=None, stiffness=None, spring_ref=None)
-    q, qd = jnp.array([0.2, 0.05, 0.3]), jnp.array([0.3, -0.1, 0.2])
-    action = Action(jnp.zeros(3), jnp.zeros(3), jnp.full(3, 50.0), jnp.zeros(3))
-    torques = []
-    for robot in (sprung, bare):
-        ctrl = controller(robot)
-        setpoint = ctrl.setpoint(q, action, 0.0)
-        out = jax.jit(ctrl)(q, qd, setpoint, Obstacles.empty())
-        assert not out.diagnostics["torque_limit"].any()
-        torques.append(out.tau)
-    expected = [3 * 0.3 + 20 * (0.2 - 0.4), 40 * -0.1, 5 * (0.3 + 0.2)]
-    np.testing.assert_allclose(torques[0] - torques[1], expected, atol=1e-4)
-
-
-def test_an_arm_without_them_has_no_such_arrays():
-    """None, so that the program of a controller is the one without the terms."""
-    robot = Robot.from_mjcf(text(a="", b='type="slide"', c=""), site="tip")
-    assert robot.damping is robot.stiffness is robot.spring_ref is None
-    shipped = Robot.load()
-    assert shipped.damping is shipped.stiffness is None
-    compensated = Robot.load(compensate_passive=True)
-    np.testing.assert_array_equal(compensated.damping, [0.1] * 5 + [0.01] * 2)
-    assert compensated.stiffness is None
-
-
-@pytest.mark.parametrize(
-    ("joint", "message"),
-    [
-        ('damping="3" frictionloss="1.5"', r"joints \['a'\] have dry friction"),
-        ('damping="1 2"', r"joints \['a'\] have polynomial damping or stiffness"),
-        ('stiffness="1 2"', r"joints \['a'\] have polynomial damping or stiffness"),
-    ],
-)
-def test_what_cannot_be_compensated_is_named(joint, message):
-    with pytest.warns(RobotWarning, match=message) as caught:
-        Robot.from_mjcf(text(a=joint), site="tip", spacing=0.1)
-    assert len(caught) == 1
-    assert caught[0].filename == __file__  # the caller's line
-
-
-def test_a_file_without_friction_warns_of_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        Robot.from_mjcf(text(), site="tip", spacing=0.1)
-
-
-def test_gravity_compensation_is_left_out_with_a_warning(ours):
-    """The controllers carry the whole weight; so must the simulation."""
-    floating = text().replace('<body name="two"', '<body name="two" gravcomp="1"')
-    with pytest.warns(RobotWarning, match=r"bodies \['two'\] have gravcomp"):
-        robot = Robot.from_mjcf(floating, site="tip", spacing=0.1)
-    data = mujoco.MjData(robot.mj_model)
-    mujoco.mj_forward(robot.mj_model, data)
-    np.testing.assert_array_equal(data.qfrc_gravcomp, 0.0)

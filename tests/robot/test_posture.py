@@ -41,6 +41,18 @@ def test_a_keyframe_outside_a_range_is_refused():
         load(text(key=HOME.format(0.3, 2.5)))
 
 
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_a_hundred_thousandth_beyond_a_range_is_rounding(end):
+    """Of a radian, or of the coordinate where that is more."""
+    span = "0 9" if end < 0 else "-9 0"
+    assert load(text(span), q_home=[0.0, end * 1e-5]).q_home[1] == end * 1e-5
+    with pytest.raises(RobotError, match="outside its range"):
+        load(text(span), q_home=[0.0, end * 1.1e-5])
+    assert load(text("-8 8"), q_home=[0.0, end * 8.00007]).q_home[1] == end * 8.00007
+    with pytest.raises(RobotError, match="outside its range"):
+        load(text("-8 8"), q_home=[0.0, end * 8.00009])
+
+
 def test_a_posture_given_replaces_the_files():
     robot = load(text(key=HOME.format(0.3, 2.5)), q_home=[7.0, 2.0])
     assert robot.q_home.tolist() == [7.0, 2.0]  # joint a turns freely
