@@ -81,10 +81,10 @@ def segment_distance(
     is an end.
     """
     u, v, w = b - a, d - c, a - c
-    uu, uv, vv = ((x * y).sum(-1) for x, y in ((u, u), (u, v), (v, v)))
-    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
-    cross = uu * vv - uv**2
-    s = np.clip((uv * vw - vv * uw) / np.where(cross > 1e-12, cross, 1.0), 0.0, 1.0)
+    uu, uv, vv = ((x * y).sum(1) for x, y in ((u, u), (u, v), (v, v)))
+    uw, vw = (u * w).sum(1), (v * w).sum(1)
+    cross = np.maximum(uu * vv - uv**2, 1e-24)
+    s = np.clip((uv * vw - vv * uw) / cross, 0.0, 1.0)
     inner = _to_segment(a + s[:, None] * u, c, d)
     ends = [_to_segment(*x) for x in ((a, c, d), (b, c, d), (c, a, b), (d, a, b))]
     return np.minimum.reduce([inner, *ends])
@@ -93,9 +93,9 @@ def segment_distance(
 def _to_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Distances of points (s, 3) from the segments from a to b, (s,)."""
     u = b - a
-    square = np.maximum((u * u).sum(-1), 1e-24)
-    t = np.clip(((x - a) * u).sum(-1) / square, 0.0, 1.0)
-    return np.linalg.norm(x - a - t[:, None] * u, axis=-1)
+    square = np.maximum((u * u).sum(1), 1e-24)
+    t = np.clip(((x - a) * u).sum(1) / square, 0.0, 1.0)
+    return np.linalg.norm(x - a - t[:, None] * u, axis=1)
 
 
 def touching_pairs(robot: Any, samples: int = 2000) -> tuple[tuple[int, int], ...]:

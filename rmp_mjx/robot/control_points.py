@@ -62,7 +62,7 @@ def body_capsules(model, data, segment, frames_p, frames_R, carriers):
         The capsules, and the body name of each.
     """
     starts, ends, radii, segments, geoms, bodies = [], [], [], [], [], []
-    collide = (model.geom_contype | model.geom_conaffinity) != 0
+    collide = (model.geom_contype | model.geom_conaffinity).astype(bool)
     if not np.any(collide & (segment[model.geom_bodyid] >= 0)):
         warn(
             "no geom of a moving link collides (contype and conaffinity are 0): all "
@@ -84,8 +84,8 @@ def body_capsules(model, data, segment, frames_p, frames_R, carriers):
             geoms.append(model.geom(geom).name)
             bodies.append(model.body(body).name)
     capsules = Capsules(
-        start=np.reshape(starts, (-1, 3)),
-        end=np.reshape(ends, (-1, 3)),
+        start=np.reshape(starts, (len(starts), 3)),
+        end=np.reshape(ends, (len(ends), 3)),
         radius=np.array(radii, float),
         segment=tuple(segments),
         geom=tuple(geoms),
@@ -153,7 +153,7 @@ def sample_control_points(
         start, end = capsules.start[c], capsules.end[c]
         count = int(np.ceil(np.linalg.norm(end - start) / spacing - 1e-9)) + 1
         b = model.body(bodies[c]).id
-        for s in np.linspace(0.0, 1.0, count) if count > 1 else [0.5]:
+        for s in np.linspace(0.0, 1.0, count):
             x = (1 - s) * start + s * end
             world = frames_p[k] + frames_R[k] @ x
             offset.append(x)
@@ -162,9 +162,9 @@ def sample_control_points(
             segment.append(k)
             body.append(bodies[c])
     return ControlPoints(
-        offset=np.reshape(offset, (-1, 3)),
+        offset=np.reshape(offset, (len(offset), 3)),
         radius=np.array(radius, float),
-        body_offset=np.reshape(body_offset, (-1, 3)),
+        body_offset=np.reshape(body_offset, (len(offset), 3)),
         segment=tuple(segment),
         body=tuple(body),
     )

@@ -113,10 +113,10 @@ def forward_kinematics(
             p = p + _dot(R, robot.offset[j])
         R = _dot(R, robot.rotation[j])
         if robot.hinge[j]:
-            x, y, z = R[:, 0], R[:, 1], R[:, 2]
+            x, y, z = R[:, 0], R[:, 1], R[:, -1]
             R = jnp.stack([c[j] * x + s[j] * y, c[j] * y - s[j] * x, z], axis=1)
         else:
-            p = p + R[:, 2] * shift[j]
+            p = p + R[:, -1] * shift[j]
         p, R = jax.lax.optimization_barrier((p, R))
         origins.append(p)
         rotations.append(R)
@@ -126,7 +126,7 @@ def forward_kinematics(
 def arm_state(robot: Robot, q: Float[Array, " n"], qd: Float[Array, " n"]) -> ArmState:
     """Frames, joint columns, twists and bias accelerations of the whole chain."""
     p, R = forward_kinematics(robot, q)
-    z = Vec.of(R[:, 2], 0)
+    z = Vec.of(R[:, -1], 0)
     hinge = np.array(robot.hinge)
     S = Motion(
         Vec.of(p, 0).cross(z).map(lambda turn, slide: jnp.where(hinge, turn, slide), z),

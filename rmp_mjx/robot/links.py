@@ -22,7 +22,7 @@ def frame_with_z(z: np.ndarray) -> np.ndarray:
 def segments(model: mujoco.MjModel, ids: Sequence[int]) -> np.ndarray:
     """Index of the last chain joint at or above each body; -1 for the fixed base."""
     segment = np.full(model.nbody, -1)
-    for body in range(1, model.nbody):
+    for body in range(model.nbody):  # the world is its own parent
         own = [k for k, j in enumerate(ids) if model.jnt_bodyid[j] == body]
         segment[body] = own[-1] if own else segment[model.body_parentid[body]]
     return segment
@@ -36,9 +36,7 @@ def lumped_inertias(model, data, segment, frames_p, frames_R):
         bodies = np.flatnonzero(segment == k)
         m = model.body_mass[bodies]
         mass[k] = m.sum()
-        centre = m @ data.xipos[bodies] / max(mass[k], 1e-12)
-        if mass[k] <= 0:
-            centre = frames_p[k]
+        centre = m @ data.xipos[bodies] / mass[k] if mass[k] else frames_p[k]
         world = np.zeros((3, 3))
         for b in bodies:
             R = data.ximat[b].reshape(3, 3)
@@ -54,7 +52,7 @@ def carriers(
     model: mujoco.MjModel, segment: np.ndarray, links: Sequence[str] | None
 ) -> set[int]:
     """Bodies whose geoms become capsules."""
-    with_geoms = [b for b in range(1, model.nbody) if model.body_geomnum[b] > 0]
+    with_geoms = [b for b in range(1, model.nbody) if model.body_geomnum[b]]
     names = {model.body(b).name: b for b in with_geoms}
     if links is None:
         return set(with_geoms)

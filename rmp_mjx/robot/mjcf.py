@@ -55,7 +55,7 @@ def _make_assets_absolute(spec: mujoco.MjSpec) -> None:
         theirs = asset.compiler.texturedir if texture else asset.compiler.meshdir
         attached = theirs != (own.texturedir if texture else own.meshdir)
         file = Path(theirs) / asset.file
-        if attached and asset.file and file.is_absolute() and file.is_file():
+        if attached and file.is_absolute() and file.is_file():
             asset.file = str(file)
 
 
@@ -80,7 +80,7 @@ def lock_other_joints(
         The names of the chain's joints, base first.
     """
     chain, body = [], spec.site(site).parent
-    while body is not None and body.name != "world":
+    while body.name != "world":
         chain = [*body.joints, *chain]
         body = body.parent
     for joint in chain:

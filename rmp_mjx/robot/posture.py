@@ -123,7 +123,8 @@ def _check(
     upper: np.ndarray,
 ) -> None:
     slack = _ROUNDING * np.maximum(1.0, np.abs(q))
-    for j in map(int, np.flatnonzero((q < lower - slack) | (q > upper + slack))):
+    beyond = np.abs(q - np.clip(q, lower, upper))
+    for j in map(int, np.flatnonzero(beyond > slack)):
         raise RobotError(
             f"{what} puts joint '{joints[j]}' at {q[j]:g}, outside its range "
             f"[{lower[j]:g}, {upper[j]:g}]: pass q_home= with a posture within the "
