@@ -57,7 +57,7 @@ def add_finger(spec: mujoco.MjSpec, site: str, turn: float) -> str:
     body.add_geom(
         name=_free("finger", [g.name for g in spec.geoms]),
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=[RADIUS, 0.0, 0.0],
+        size=np.full(3, RADIUS),
         fromto=[0.0, 0.0, 0.0, 0.0, 0.0, LENGTH - TIP],
         mass=MASS,
         contype=1,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from rmp_mjx.robot import configurations
 from rmp_mjx.robot.configurations import (
     capsule_ends,
     capsule_gaps,
@@ -105,3 +106,18 @@ def test_a_segment_without_length_is_a_point():
     assert segment_distance(y, y, -x, x) == 1.0
     assert segment_distance(-x, x, y, y) == 1.0
     assert segment_distance(zero, zero, 2 * x, 2 * x) == 2.0
+
+
+def test_two_thousand_configurations_are_drawn_from_a_fixed_seed(bent, monkeypatch):
+    """Links that come near in the last of them only are watched."""
+    low = np.where(np.isfinite(bent.q_lower), bent.q_lower, -np.pi)
+    high = np.where(np.isfinite(bent.q_upper), bent.q_upper, np.pi)
+    drawn = np.random.default_rng(0).uniform(low, high, (2000, 4))
+    np.testing.assert_array_equal(random_configurations(bent, 2000), drawn)
+
+    def gaps(robot, q, pairs):
+        last = (q == drawn[-1]).all(axis=1)
+        return np.where(last[:, None], [0.0, *[1.0] * (len(pairs) - 1)], 1.0)
+
+    monkeypatch.setattr(configurations, "capsule_gaps", gaps)
+    assert len(touching_pairs(bent)) == 1

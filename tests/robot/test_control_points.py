@@ -1,10 +1,12 @@
 """Control points and link capsules against MuJoCo's geoms."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
 
-from rmp_mjx import Robot
+from rmp_mjx import Robot, RobotWarning
 from rmp_mjx.robot.configurations import capsule_ends
 from rmp_mjx.robot.control_points import hull_corners
 from rmp_mjx.robot.enclose import distance_to_segment
@@ -136,6 +138,57 @@ def test_every_geom_is_inside_its_capsules(text):
     assert len(seen) == len(robot.capsules.geom)
 
 
+def _rod(length, first="", second="", base=""):
+    """Two links, each with a capsule of this length, on a base with a ball."""
+    rod = f'type="capsule" fromto="0 0 .1 {length} 0 .1" size=".02"'
+    return f"""<mujoco><worldbody><body name="base">
+    <geom name="base" size=".05" {base}/>
+    <body><joint name="a" axis="0 0 1" range="-2 2"/><geom name="one" {rod} {first}/>
+    <body><joint name="b" axis="0 1 0" range="-2 2"/><geom name="two" {rod} {second}/>
+    <site name="tip"/></body></body></body></worldbody><actuator>
+    <motor joint="a" ctrlrange="-9 9"/><motor joint="b" ctrlrange="-9 9"/></actuator>
+    </mujoco>"""
+
+
+@pytest.mark.parametrize("count", range(1, 12))
+def test_a_length_of_whole_spacings_has_a_point_at_each(count):
+    """Whether the quotient is rounded up or down; and the next point a little later."""
+    for length, more in ((count * 0.05, 0), (count * 0.05 + 1e-5, 1)):
+        points = Robot.from_mjcf(_rod(length), site="tip", spacing=0.05).points
+        each = count + 1 + more
+        assert points.segment == (0,) * each + (1,) * each
+        along = np.linalg.norm(points.offset[each - 1] - points.offset[0])
+        np.testing.assert_allclose(along, length, atol=1e-6)
+
+
+GHOST, ONE_WAY = 'contype="0" conaffinity="0"', 'contype="0"'
+OTHER_WAY = 'conaffinity="0"'
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "base", "names"),
+    [
+        ("", "", "", ("base", "one", "two")),
+        ("", GHOST, "", ("base", "one")),
+        ("", GHOST, GHOST, ("one",)),
+        (GHOST, "", GHOST, ("two",)),
+        (ONE_WAY, OTHER_WAY, "", ("base", "one", "two")),
+        (OTHER_WAY, ONE_WAY, GHOST, ("one", "two")),
+    ],
+)
+def test_what_collides_either_way_becomes_a_capsule(first, second, base, names):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        robot = Robot.from_mjcf(_rod(0.2, first, second, base), site="tip")
+    assert robot.capsules.geom == names
+
+
+def test_where_only_the_base_collides_everything_becomes_a_capsule():
+    with pytest.warns(RobotWarning, match="no geom of a moving link collides"):
+        robot = Robot.from_mjcf(_rod(0.2, GHOST, GHOST), site="tip")
+    assert robot.capsules.geom == ("base", "one", "two")
+
+
 SHAPES = """<mujoco><asset>
 <mesh name="first" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>
 <mesh name="second" vertex=".1 0 0 .5 0 .1 .1 .3 0 0 0 .4 .2 .2 .5"/>
@@ -161,7 +214,7 @@ def test_corners_support_a_geom_from_every_side():
     found = support(cylinder)
     assert np.all(found > radial + axial - 1e-9)
     assert np.all(found < radial / np.cos(np.pi / 32) + axial + 1e-9)
-    assert mesh.shape == (5, 3)
+    assert mesh.shape == (5, 3) and cylinder.shape == (2 * 32, 3)
     vertices = model.mesh_vert[model.mesh_vertadr[1] :]  # in the frame of the geom
     np.testing.assert_array_equal(mesh, vertices)
 
