@@ -24,6 +24,7 @@ OTHERS = {
     "control/vices": "control/test_vices control/test_controller",
     "robot/control_points": "robot/test_control_points robot/test_model",
     "robot/dynamics": "robot/test_dynamics robot/test_passive_forces robot/test_bounds",
+    "robot/enclose": "robot/test_enclose robot/test_enclose_search",
     "robot/errors": "robot/test_errors robot/test_mjcf",
     "robot/fingerprint": "robot/test_fingerprint robot/test_model",
     "robot/kinematics": "robot/test_kinematics robot/test_model",

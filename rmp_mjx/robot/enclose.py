@@ -80,13 +80,14 @@ def enclosing_capsules(points: np.ndarray, most: int = MOST) -> list[Capsule]:
         return [enclosing_capsule(whole)]
     capsules = [enclosing_capsule(pieces[0])]
     limit = THICK * hull_volume(pieces[0])
-    while len(pieces) < most and sum(capsule.volume for capsule in capsules) > limit:
-        k = int(np.argmax([capsule.volume for capsule in capsules]))
-        halves = _best_cut(pieces[k])
+    for _ in range(most - 1):
+        volumes = [capsule.volume for capsule in capsules]
+        k = int(np.argmax(volumes))
+        halves = _best_cut(pieces[k]) if sum(volumes) > limit else None
         if halves is None:
             break
         both = [enclosing_capsule(half) for half in halves]
-        if sum(capsule.volume for capsule in both) > WORTH * capsules[k].volume:
+        if sum(capsule.volume for capsule in both) > WORTH * volumes[k]:
             break
         pieces[k : k + 1], capsules[k : k + 1] = halves, both
     return capsules
@@ -127,7 +128,7 @@ def enclosing_capsule(points: np.ndarray, steps: int = 400) -> Capsule:
         for e in (capsule.start, capsule.end)
     )
     off = distance_to_segment(points, start, end)
-    return Capsule(start, end, float(off.max(initial=0.0)) * (1.0 + 1e-9))
+    return Capsule(start, end, float(off.max()) * (1.0 + 1e-9))
 
 
 def distance_to_segment(
