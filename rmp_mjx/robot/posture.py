@@ -77,7 +77,7 @@ def search_posture(robot: Any, samples: int = 4000) -> tuple[np.ndarray, str]:
     q = np.vstack([robot.q_ref[None], random_configurations(robot, samples)])
     reach = manipulability(robot, q)
     room = _room(robot, q)
-    gap = np.full(len(q), 0.1)
+    gap = np.ones(len(q))
     if robot.capsules.pairs:
         gap = capsule_gaps(robot, q, robot.capsules.pairs).min(axis=1).clip(0.0, 0.1)
     fault = ""
