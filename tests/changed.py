@@ -33,7 +33,7 @@ OTHERS = {
     "robot/model": "robot/test_model robot/test_dynamics",
     "robot/mjcf": "robot/test_mjcf robot/test_model robot/test_passive_forces",
     "robot/motors": "robot/test_motors robot/test_passive_forces",
-    "robot/point_state": "control/test_avoidance control/test_tree_equivalence",
+    "robot/point_state": "robot/test_point_state robot/test_kinematics",
 }
 """Tests of the modules without a test file of their own name, or with more than it."""
 

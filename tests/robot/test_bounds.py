@@ -221,3 +221,43 @@ def test_a_slide_without_limits_has_no_bounds(chain):
     ):
         with pytest.raises(ValueError, match="limits on every sliding joint"):
             Bounds.of(chain.replace(**limits))
+
+
+def test_levers_are_sums_of_what_mujoco_measures_at_the_reference_pose(bent):
+    """From the axis to the next joint, from joint to joint with what slides add, and
+    from the last one to a surface. 1e-9 m."""
+    measured, capsules, n = Measured(bent), bent.capsules, bent.n
+    data, model = measured.at(bent.q_ref), bent.mj_model
+    anchor, axis = data.xanchor.copy(), data.xaxis.copy()
+
+    def off(j, x):
+        return np.linalg.norm(np.cross(x - anchor[j], axis[j]), axis=-1)
+
+    def expected(k, ends, radius, upper):
+        slide = np.array([0.0, max(0.2, upper - 0.1), 0.0, 0.0])
+        row = np.zeros(n)
+        row[k] = off(k, ends).max() + radius
+        rest = np.linalg.norm(ends - anchor[k], axis=1).max() + radius
+        for j in reversed(range(k)):
+            rest += slide[j + 1]
+            row[j] = off(j, anchor[j + 1]) + rest
+            rest += np.linalg.norm(anchor[j + 1] - anchor[j])
+        row[1] = 1.0 if k >= 1 else 0.0
+        return row
+
+    for upper in (0.2, 0.7):
+        arm = bent.replace(q_upper=np.where(bent.hinge, bent.q_upper, upper))
+        lever = np.zeros((n, n))
+        for c, k in enumerate(capsules.segment):
+            g = model.geom(capsules.geom[c]).id
+            half = data.geom_xmat[g].reshape(3, 3)[:, 2] * model.geom_size[g, 1]
+            ends = data.geom_xpos[g] + np.stack([half, -half])
+            if k >= 0:
+                row = expected(k, ends, capsules.radius[c], upper)
+                lever[k] = np.maximum(lever[k], row)
+        bounds = Bounds.of(arm)
+        np.testing.assert_allclose(bounds.lever, lever, atol=1e-9)
+        centres = [
+            expected(k, data.xipos[[model.jnt_bodyid[k]]], 0.0, upper) for k in range(n)
+        ]
+        np.testing.assert_allclose(bounds.centre, centres, atol=1e-9)
