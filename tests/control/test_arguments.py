@@ -27,6 +27,7 @@ Q = np.zeros(3, np.float32)
 ZERO = np.zeros(3, np.float32)
 ACTION = Action(ZERO, ZERO, ZERO, ZERO)
 SLOTS = Obstacles.empty(spheres=2, boxes=1)
+ONE = Obstacles.empty(spheres=1).spheres
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +88,16 @@ WRONG = {
         spheres(radius=np.ones(1)),
         "obstacles.spheres.radius must be a float array of shape (2,), "
         "got float64 (1,)",
+    ),
+    "slots of a batch": (
+        spheres(active=np.ones((8, 2), bool)),
+        "obstacles.spheres.active must be a bool array of shape (2,), got bool (8, 2); "
+        "batches go through jax.vmap(ctrl)",
+    ),
+    "a slot without a number": (
+        {"obstacles": SLOTS.replace(spheres=changed(ONE, active=np.True_))},
+        "obstacles.spheres.velocity must be a float array of shape (0, 3), got float32 "
+        "(1, 3)",
     ),
     "numbers as flags": (
         spheres(active=np.ones(2)),

@@ -9,6 +9,7 @@ import pytest
 
 from rmp_mjx import VICES, Obstacles, Robot
 from rmp_mjx.control.cbf import project
+from rmp_mjx.robot.configurations import capsule_gaps
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import arm_state
 from tests import oracles
@@ -159,6 +160,78 @@ def test_where_nothing_is_near_it_is_vices(filtered, run):
     assert free.sum() > 2
     error = distance(Mq[free], (out.qdd - vices)[free])
     assert error.max() < 1e-2
+
+
+def one_barrier(distance, rate, drift, row, count=1):
+    """The same barrier several times."""
+    rows = np.tile(np.float32(row), (count, 1))
+    numbers = (np.full(count, x, np.float32) for x in (distance, rate, drift))
+    return cbf.Barriers(*numbers, rows, np.ones(count, bool))
+
+
+@jax.jit
+def change_of(filtered, barriers, wanted):
+    """The filtered acceleration of three masses of 1 kg m^2, (3,)."""
+    return filtered._filter(wanted, barriers, jnp.eye(3), jnp.zeros(3))[0]
+
+
+def test_a_distance_is_kept_with_both_poles_at_10_per_second(filtered):
+    """x = -need up to the penalty of a thousand, 300 at most; rows have no length.
+    Shorter ones than 1e-3 do not count. 1e-5: float32."""
+    soft, still = 1000.0 / 1001.0, np.zeros(3, np.float32)
+    for distance, rate, drift in ((0.01, -0.1, -0.5), (-0.02, 0.02, 0.1)):
+        need = drift + 20.0 * rate + 100.0 * distance
+        assert need < 0.0
+        barrier = one_barrier(distance, rate, drift, [0.0, 2.0, 0.0])
+        qdd = change_of(filtered, barrier, still + np.float32(0.2))
+        over = soft * (-need / 2.0 - 0.2)
+        np.testing.assert_allclose(qdd, [0.2, 0.2 + over, 0.2], rtol=1e-5)
+    for most, expected in ((299.0, 299.0), (301.0, 300.0)):
+        strong = filtered.replace(robot=filtered.robot.replace(tau_max=np.full(3, 1e4)))
+        barrier = one_barrier(0.0, 0.0, -most, [1.0, 0.0, 0.0])
+        qdd = change_of(strong, barrier, still)
+        np.testing.assert_allclose(qdd[0], soft * expected, rtol=1e-5)
+    for length, counts in ((0.99e-3, False), (1.01e-3, True)):
+        barrier = one_barrier(0.0, 0.0, -1e-3, [length, 0.0, 0.0])
+        qdd = change_of(filtered, barrier, still)
+        assert (qdd[0] > 0.0) == counts
+
+
+def test_48_constraints_are_in_the_program(filtered, monkeypatch):
+    """Or all that there are: six are the torque limits."""
+    sizes = []
+
+    def solved(G, h, penalty):
+        sizes.append(G.shape[1])
+        return jnp.zeros(len(G)), jnp.ones(())
+
+    monkeypatch.setattr(cbf, "project", solved)
+    for count in (30, 60):
+        barriers = one_barrier(1.0, 0.0, 0.0, [1.0, 0.0, 0.0], count)
+        jax.eval_shape(change_of.__wrapped__, filtered, barriers, jnp.zeros(3))
+    assert sizes == [36, 48]
+
+
+def test_margins_are_5_mm_and_a_twelfth_of_a_radian_and_more(bent):
+    """Distances by NumPy, less 5 mm; room to the joints' limits, less 0.12. A joint
+    without limits has none. 1e-6: float32."""
+    ctrl, q = cbf.FilteredVICES(bent), bent.q_ref + 0.1
+
+    @jax.jit
+    def barriers(q):
+        arm = arm_state(bent, q, jnp.zeros(4))
+        return ctrl.barriers(arm, q, arm.qd, Obstacles.empty())
+
+    found = barriers(np.float32(q))
+    pairs = len(bent.capsules.pairs)
+    gaps = capsule_gaps(bent, q[None], bent.capsules.pairs)[0]
+    np.testing.assert_allclose(found.distance[:pairs], gaps - 0.005, atol=1e-6)
+    room = np.concatenate([q - bent.q_lower, bent.q_upper - q])
+    active = np.asarray(found.active[pairs:])
+    np.testing.assert_array_equal(active, np.isfinite(room))
+    np.testing.assert_allclose(
+        found.distance[pairs:][active], room[active] - 0.12, atol=1e-6
+    )
 
 
 clarabel = pytest.importorskip("clarabel")

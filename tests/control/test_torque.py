@@ -41,6 +41,24 @@ def test_clipping_works_joint_by_joint(tau):
     )
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_torque_at_its_limit_counts_as_at_it(side):
+    tau = side * LIMIT
+    for change, expected in ((1.0, side), (0.999, 0.0), (1.001, side)):
+        clipped, limit = clip(np.float32(change) * tau, -LIMIT, LIMIT)
+        np.testing.assert_array_equal(limit, np.full(N, expected))
+        assert np.all(np.abs(clipped) <= LIMIT)
+
+
+@pytest.mark.parametrize("load", [0.94, 0.96, 1.0, 1.5])
+def test_a_load_near_the_limit_leaves_a_twentieth_of_it(load):
+    """The time is that of momentum over room: the load pulls on as the joint turns."""
+    A, qd = np.diag([2.0, 3.0, 4.0]).astype("f"), np.array([0.0, -0.5, 0.0], "f")
+    most = np.full(N, 10.0, "f")
+    found = stopping(A, np.float32(10.0 * load) * np.ones(N, "f"), qd, most)
+    np.testing.assert_allclose(found, 1.5 / max(0.5, 10.0 * (1.0 - load)), rtol=1e-4)
+
+
 @compiled
 @given(_vectors(3.0), _vectors(0.5), _vectors(1.0))
 def test_the_arm_can_stop_in_its_time_to_stop(qd, load, numbers):
