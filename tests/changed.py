@@ -30,7 +30,7 @@ OTHERS = {
     "robot/kinematics": "robot/test_kinematics robot/test_model",
     "robot/limits": "robot/test_model robot/test_mjcf robot/test_library",
     "robot/links": "robot/test_model robot/test_mjcf",
-    "robot/model": "robot/test_model robot/test_dynamics",
+    "robot/model": "robot/test_model robot/test_dynamics robot/test_library",
     "robot/mjcf": "robot/test_mjcf robot/test_model robot/test_passive_forces",
     "robot/motors": "robot/test_motors robot/test_passive_forces",
     "robot/point_state": "robot/test_point_state robot/test_kinematics",

@@ -53,6 +53,14 @@ def test_the_new_site_takes_a_name_that_is_free(path):
     assert Robot.from_mjcf(path, body="hand").site_name == "end_effector_1"
 
 
+def test_bodies_may_have_names_beyond_the_worlds(path):
+    """In the alphabet; the outermost one is proposed."""
+    path.write_text(text().replace('"hand"', '"zone"'))
+    assert Robot.from_mjcf(path, body="zone").n == 1
+    with pytest.raises(RobotError, match="body='zone'; bodies: arm, zone"):
+        Robot.from_mjcf(path, site="ee")
+
+
 REFUSED = {
     "no sites": (
         "",

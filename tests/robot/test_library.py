@@ -168,6 +168,12 @@ def test_a_files_limits_must_be_one_positive_number_for_each_joint():
         Robot.from_mjcf(text, site="ee")
 
 
+def test_a_body_takes_the_place_of_the_site_that_goes_with_a_name():
+    robot = Robot.load("planar3", body="link3", offset=[0.0, 0.0, 0.1])
+    assert robot.site_name == "end_effector"
+    assert Robot.load("planar3", site="ee").site_name == "ee"
+
+
 def test_rotor_inertias_can_be_given_by_numbers():
     robot = Robot.load("planar3", armature=[0.1, 0.2, 0.3])
     np.testing.assert_allclose(robot.armature, [0.1, 0.2, 0.3])

@@ -41,7 +41,7 @@ def test_the_grip_is_15_cm_out_of_the_flange_and_turned_about_the_finger(
 
 
 def test_seen_from_the_grip_the_finger_ends_as_the_jacos(fingered):
-    """Tip and radius, in the frame of the grip."""
+    """Tip and radius, in the frame of the grip; the other end is at the flange."""
     jaco = Robot.load("jaco2")
     tips, radii = [], []
     for robot, geom in ((jaco, "fingers"), (fingered, "finger")):
@@ -49,9 +49,11 @@ def test_seen_from_the_grip_the_finger_ends_as_the_jacos(fingered):
         assert robot.capsules.segment[k] == robot.n - 1
         ends = np.stack([robot.capsules.start[k], robot.capsules.end[k]])
         seen = (ends - robot.site_offset) @ robot.site_rotation
-        tips.append(seen[np.argmax(seen[:, 2])])
+        first, last = seen[np.argsort(seen[:, 2])]
+        tips.append(last)
         radii.append(robot.capsules.radius[k])
     np.testing.assert_allclose(*tips, atol=2e-6)
+    np.testing.assert_allclose(first, [0.0, 0.0, -0.15], atol=2e-6)  # the flange
     assert radii[0] == radii[1]
 
 
