@@ -138,6 +138,7 @@ def test_control_is_torque_up_to_the_limit(text, limit):
     np.testing.assert_array_equal(applied(robot, [1.5, -2.5]), [1.5, -2.5])
     np.testing.assert_array_equal(applied(robot, [99, -99]), [5.0, -limit])
     assert not model.actuator_gear[:, 1:].any()  # of six gears a hinge has one
+    assert [a.nsample for a in robot.mj_spec.actuators] == [0, 0]
 
 
 @pytest.mark.parametrize("name", ACCEPTED)

@@ -84,6 +84,16 @@ def test_the_base_stands_elsewhere_and_nothing_else_changes(bare):
     assert moved.fingerprint != bare.fingerprint
 
 
+def test_names_that_are_taken_get_a_number(fingered):
+    """A finger on the finger; and one more."""
+    robot = fingered
+    for k in (1, 2):
+        site, home = robot.site_name, robot.q_home
+        robot = Robot.from_mjcf(robot.mjcf, site, finger=0.0, q_home=home)
+        assert robot.site_name == f"grip_{k}"
+        assert robot.points.body[-1] == robot.capsules.geom[-1] == f"finger_{k}"
+
+
 def test_a_wrong_place_is_refused():
     with pytest.raises(RobotError, match="mount must be 3 finite numbers"):
         Robot.load("ur5e", mount=[0.0, 1.0])
