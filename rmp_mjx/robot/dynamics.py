@@ -108,7 +108,7 @@ def _world_inertia(robot: Robot, arm: ArmState) -> tuple[Vec, Vec, Vec]:
             *(
                 row.x * inertia[:, 0, j]
                 + row.y * inertia[:, 1, j]
-                + row.z * inertia[:, 2, j]
+                + row.z * inertia[:, -1, j]
                 for j in range(3)
             )
         )

@@ -113,7 +113,7 @@ def pull_to_joints(
     )
     xx, xy, xz, yy, yz, zz = sums[6:12]
     a, b, c = (Vec.of(sums[i : i + 3], 0) for i in (12, 15, 18))
-    txx, txy, txz, tyy, tyz, tzz = sums[21:27]
+    txx, txy, txz, tyy, tyz, tzz = sums[21:]
     lin, ang = arm.S.lin, arm.S.ang
     momentum = Motion(
         Vec(Vec(xx, xy, xz) @ lin, Vec(xy, yy, yz) @ lin, Vec(xz, yz, zz) @ lin)
