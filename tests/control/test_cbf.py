@@ -164,12 +164,15 @@ def test_where_nothing_is_near_it_is_vices(filtered, run):
 
 def one_barrier(distance, rate, drift, row, count=1):
     """The same barrier several times."""
-    rows = np.tile(np.float32(row), (count, 1))
-    numbers = (np.full(count, x, np.float32) for x in (distance, rate, drift))
-    return cbf.Barriers(*numbers, rows, np.ones(count, bool))
+    return cbf.Barriers(
+        jnp.full(count, distance),
+        jnp.full(count, rate),
+        jnp.full(count, drift),
+        jnp.tile(jnp.array(row), (count, 1)),
+        jnp.ones(count, bool),
+    )
 
 
-@jax.jit
 def change_of(filtered, barriers, wanted):
     """The filtered acceleration of three masses of 1 kg m^2, (3,)."""
     return filtered._filter(wanted, barriers, jnp.eye(3), jnp.zeros(3))[0]
@@ -178,22 +181,22 @@ def change_of(filtered, barriers, wanted):
 def test_a_distance_is_kept_with_both_poles_at_10_per_second(filtered):
     """x = -need up to the penalty of a thousand, 300 at most; rows have no length.
     Shorter ones than 1e-3 do not count. 1e-5: float32."""
-    soft, still = 1000.0 / 1001.0, np.zeros(3, np.float32)
+    soft, still, change = 1000.0 / 1001.0, np.zeros(3, np.float32), jax.jit(change_of)
     for distance, rate, drift in ((0.01, -0.1, -0.5), (-0.02, 0.02, 0.1)):
         need = drift + 20.0 * rate + 100.0 * distance
         assert need < 0.0
         barrier = one_barrier(distance, rate, drift, [0.0, 2.0, 0.0])
-        qdd = change_of(filtered, barrier, still + np.float32(0.2))
+        qdd = change(filtered, barrier, still + np.float32(0.2))
         over = soft * (-need / 2.0 - 0.2)
         np.testing.assert_allclose(qdd, [0.2, 0.2 + over, 0.2], rtol=1e-5)
     for most, expected in ((299.0, 299.0), (301.0, 300.0)):
         strong = filtered.replace(robot=filtered.robot.replace(tau_max=np.full(3, 1e4)))
         barrier = one_barrier(0.0, 0.0, -most, [1.0, 0.0, 0.0])
-        qdd = change_of(strong, barrier, still)
+        qdd = change(strong, barrier, still)
         np.testing.assert_allclose(qdd[0], soft * expected, rtol=1e-5)
     for length, counts in ((0.99e-3, False), (1.01e-3, True)):
         barrier = one_barrier(0.0, 0.0, -1e-3, [length, 0.0, 0.0])
-        qdd = change_of(filtered, barrier, still)
+        qdd = change(filtered, barrier, still)
         assert (qdd[0] > 0.0) == counts
 
 
@@ -208,7 +211,7 @@ def test_48_constraints_are_in_the_program(filtered, monkeypatch):
     monkeypatch.setattr(cbf, "project", solved)
     for count in (30, 60):
         barriers = one_barrier(1.0, 0.0, 0.0, [1.0, 0.0, 0.0], count)
-        jax.eval_shape(change_of.__wrapped__, filtered, barriers, jnp.zeros(3))
+        jax.eval_shape(change_of, filtered, barriers, jnp.zeros(3))
     assert sizes == [36, 48]
 
 
