@@ -18,58 +18,37 @@ from benchmarks.common import Row, show, write_json
 from benchmarks.speed.bench_controller import BATCH, random_states
 from rmp_mjx import runtime
 from rmp_mjx.control.cbf import FilteredVICES
+from rmp_mjx.control.controller import ImpedanceController
 from rmp_mjx.robot.kinematics import arm_state
 
-
-class Trusting:
-    """A controller that does not look at its inputs."""
-
-    def __call__(self, q, qd, setpoint, obstacles, tau_ext=None, tau_last=None):
-        """Torque for one state."""
-        arm = arm_state(self.robot, q, qd)
-        return self.unguarded(arm, setpoint, obstacles, tau_ext, tau_last)
+KINDS = {"rmp_vices": rmp.RMPVICES, "vices": rmp.VICES, "vices_cbf": FilteredVICES}
+"""The controllers by name."""
 
 
-class TrustingRMPVICES(Trusting, rmp.RMPVICES):
-    """RMP-VICES without the check."""
-
-
-class TrustingVICES(Trusting, rmp.VICES):
-    """VICES without the check."""
-
-
-class TrustingCBF(Trusting, FilteredVICES):
-    """The filter without the check."""
-
-
-PAIRS = {
-    "rmp_vices": (rmp.RMPVICES, TrustingRMPVICES),
-    "vices": (rmp.VICES, TrustingVICES),
-    "vices_cbf": (FilteredVICES, TrustingCBF),
-}
-"""Each controller with the check, and without it."""
-
-
-def ratios(robot: rmp.Robot, kinds: tuple, batch: int, calls: int) -> np.ndarray:
+def ratios(ctrl: ImpedanceController, batch: int, calls: int) -> np.ndarray:
     """Time with the check over time without it, call by call, (calls,).
 
     Args:
-        robot: The arm.
-        kinds: The two controllers' classes.
+        ctrl: The controller.
         batch: States of a call.
         calls: Number of pairs of calls; who is first alternates.
     """
-    q, qd, action, obstacles = random_states(robot, batch, seed=0)
-    compiled = []
-    for kind in kinds:
-        ctrl = kind(robot)
-        setpoint = jax.vmap(ctrl.setpoint, in_axes=(0, 0, None))(q, action, 0.0)
+    q, qd, action, obstacles = random_states(ctrl.robot, batch, seed=0)
+    setpoint = jax.vmap(ctrl.setpoint, in_axes=(0, 0, None))(q, action, 0.0)
 
-        def torque(q, qd, setpoint, obstacles, ctrl=ctrl):
-            return ctrl(q, qd, setpoint, obstacles).tau
+    def checked(q, qd, setpoint, obstacles):
+        return ctrl(q, qd, setpoint, obstacles).tau
 
-        every = jax.jit(jax.vmap(torque, in_axes=(0, 0, 0, None)))
-        compiled.append(every.lower(q, qd, setpoint, obstacles).compile())
+    def trusting(q, qd, setpoint, obstacles):
+        arm = arm_state(ctrl.robot, q, qd)
+        return ctrl.unguarded(arm, setpoint, obstacles, None, None).tau
+
+    compiled = [
+        jax.jit(jax.vmap(torque, in_axes=(0, 0, 0, None)))
+        .lower(q, qd, setpoint, obstacles)
+        .compile()
+        for torque in (checked, trusting)
+    ]
     found = []
     for turn in range(calls + 10):
         spent = [0.0, 0.0]
@@ -97,8 +76,8 @@ def main() -> None:
     args = parser.parse_args()
     runtime.configure(split_cpu=True, compile_cache=False)
     robot, rows = rmp.Robot.load("jaco2"), []
-    for name, kinds in PAIRS.items():
-        found = 100.0 * (ratios(robot, kinds, BATCH, args.calls) - 1.0)
+    for name, kind in KINDS.items():
+        found = 100.0 * (ratios(kind(robot), BATCH, args.calls) - 1.0)
         low, high = interval(found)
         note = f"of {args.calls} pairs of calls; 95 % interval {low:.1f} to {high:.1f}"
         rows.append(Row(f"check_cost_{name}", float(np.median(found)), "%", note))
