@@ -56,6 +56,9 @@ STANDING = 0.01
 APPROACH, HOLD = 120, 400
 """Policy steps to reach the block, and to push against it (20 s)."""
 
+BLOCKED = (20.0, 50.0, 100.0, 300.0)
+"""Orientation stiffnesses at a block that does not move [1/s^2]."""
+
 
 class Crossing(NamedTuple):
     """A straight way with spheres in it, and the torque limits."""
@@ -280,7 +283,7 @@ def blocked(worlds: int, seed: int) -> tuple[list[Row], str]:
     """Effect on the arm of pushing an immovable block for 20 s."""
     rows, lines = [], []
     worlds = max(worlds // 4, 2)
-    stiff = np.repeat([50.0, 300.0], worlds)
+    stiff = np.repeat(BLOCKED, worlds)
     for name, title in CONTROLLERS.items():
         figures = push_on(name, stiff, seed)
         first = figures["touched"].argmax(axis=0)

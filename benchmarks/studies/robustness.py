@@ -8,6 +8,7 @@ defaults. The named failures of `benchmarks.failures` are measured too. Run as
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -190,7 +191,15 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         help="arm, by name or path; another than the Jaco 2 has no axis `armature` "
         "and no failures",
     )
+    parser.add_argument(
+        "--failure",
+        choices=tuple(failures.FAILURES),
+        action="append",
+        help="only this failure; the JSON file keeps its other rows; may be repeated",
+    )
     args = parser.parse_args(argv)
+    if args.failure and (args.axis or args.plot or args.robot != JACO):
+        parser.error("--failure goes with --json and --docs alone")
     if args.robot != JACO:
         args.axis = args.axis or [name for name in AXES if name != "armature"]
         if "armature" in args.axis:
@@ -207,17 +216,20 @@ def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
     runtime.configure()
     worlds, steps = (4, 320) if args.quick else (args.worlds, args.steps)
-    axes = args.axis or tuple(AXES)
+    axes = () if args.failure else args.axis or tuple(AXES)
     results = dict(sweep(axes, worlds, steps, args.seed, args.robot))
     rows = [row for key, result in results.items() for row in rows_of(key, result)]
     tables = {name: table(AXES[name], results) for name in axes}
-    if not args.axis:
-        for name, failure in failures.FAILURES.items():
-            began = time.perf_counter()
-            found, tables[name] = failure(2 * worlds, args.seed)
-            rows += found
-            print(f"{name}: {time.perf_counter() - began:.0f} s")
+    for name in args.failure or (() if args.axis else failures.FAILURES):
+        began = time.perf_counter()
+        found, tables[name] = failures.FAILURES[name](2 * worlds, args.seed)
+        rows += found
+        print(f"{name}: {time.perf_counter() - began:.0f} s")
     show(rows, "Where safety ends")
+    if args.failure and args.json and args.json.is_file():
+        known = (Row(**row) for row in json.loads(args.json.read_text())["rows"])
+        others = (row for row in known if row.key.split("/")[0] not in args.failure)
+        rows = [*others, *rows]
     if args.json:
         settings = {"seed": args.seed, "worlds": worlds, "steps": steps}
         settings["robot"] = args.robot
