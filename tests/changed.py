@@ -15,6 +15,7 @@ OTHERS = {
     "rmp/leaves/joint_limit": "rmp/test_formulas rmp/test_leaves control/test_contact",
     "rmp/leaves/posture": "rmp/test_formulas rmp/test_leaves",
     "control/contact": "control/test_contact control/test_controller",
+    "control/controller": "control/test_controller control/test_guard",
     "control/guard": "control/test_guard_terms control/test_guard",
     "control/leaves": "control/test_tree_equivalence control/test_pytree",
     "control/literal": "control/test_controller rmp/test_leaves",
