@@ -269,6 +269,7 @@ def test_noise_of_the_velocities_is_as_large_as_stated(robot):
 
 
 def test_a_delay_shifts_the_estimates_by_whole_steps(robot, pressed):
+    assert ContactObserver().delay == ContactObserver.of(robot).delay == 0
     now = estimates(robot, pressed, gain=100.0)
     late = estimates(robot, pressed, gain=100.0, delay=3)
     np.testing.assert_array_equal(late[:3], 0.0)
