@@ -96,9 +96,9 @@ def test_the_key_alone_decides_an_episode(task):
     assert len(np.unique(first.obs, axis=0)) == LANES
 
 
-def test_a_thousand_random_steps_stay_finite(task):
+def test_random_steps_stay_finite(task):
     state = task.reset(keys(3))
-    chosen = actions(task.env, 3, 1000, LANES)
+    chosen = actions(task.env, 3, 300, LANES)
     bad = jnp.zeros(LANES)
     for action in chosen:
         state = task.step(state, action)
