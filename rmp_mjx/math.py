@@ -39,6 +39,50 @@ def psd_solve(
     n = A.shape[-1]
     if A.shape != (n, n) or b.ndim not in (1, 2) or b.shape[0] != n:
         raise ValueError(f"psd_solve needs A (n, n), b (n,): got {A.shape}, {b.shape}")
+    scale, ell, inverse_pivot = _ldl(A)
+    x = [b[i] * scale[i] for i in range(n)]
+    for i in range(n):
+        for k in range(i):
+            x[i] = x[i] - ell[i][k] * x[k]
+    x = [x[i] * inverse_pivot[i] for i in range(n)]
+    for i in reversed(range(n)):
+        for k in range(i + 1, n):
+            x[i] = x[i] - ell[k][i] * x[k]
+    x = jnp.stack([x[i] * scale[i] for i in range(n)])
+    most = jnp.finfo(A.dtype).max ** 0.5
+    solved = jnp.all(jnp.abs(x) <= most, axis=0, keepdims=True)  # False for NaN
+    return jnp.where(solved, x, 0.0 * b)
+
+
+def inverse_root(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    r"""A root of the inverse of a small PSD matrix: $A^{-1} = R^T R$.
+
+    The inverse of A's lower Cholesky factor, from the factorisation of `psd_solve` with
+    the same clamped pivots. So $x^T A^{-1} x = |R x|^2$ is never negative, also where A
+    has negative eigenvalues by rounding. Where the clamped pivots of a singular matrix
+    multiply up, R is zero. It calls no LAPACK: the batched calls of jaxlib 0.10 wait
+    for the thread pool that runs them, and can wait for ever if several CPU devices do
+    so at once.
+
+    Args:
+        A: Symmetric PSD matrix, (n, n). Only the lower triangle is read.
+    """
+    n = A.shape[-1]
+    scale, ell, inverse_pivot = _ldl(A)
+    rows: list[Array] = []
+    for i in range(n):
+        row = jnp.zeros(n, A.dtype).at[i].set(scale[i])
+        for k in range(i):
+            row = row - ell[i][k] * rows[k]
+        rows.append(row)
+    R = jnp.stack([jnp.sqrt(p) * x for p, x in zip(inverse_pivot, rows, strict=True)])
+    most = jnp.finfo(A.dtype).max ** 0.25
+    return jnp.where(jnp.all(jnp.abs(R) <= most), R, 0.0)
+
+
+def _ldl(A: Float[Array, "n n"]) -> tuple[list[Array], list[list[Array]], list[Array]]:
+    """Jacobi's scale, L below its diagonal, and the inverse pivots 1/D, unrolled."""
+    n = A.shape[-1]
     floor = n * jnp.finfo(A.dtype).eps
     diagonal = [A[i, i] for i in range(n)]
     scale = [
@@ -56,58 +100,7 @@ def psd_solve(
             for k in range(j):
                 c[i][j] = c[i][j] - c[i][k] * ell[j][k]
             ell[i][j] = c[i][j] * inverse_pivot[j]
-    x = [b[i] * scale[i] for i in range(n)]
-    for i in range(n):
-        for k in range(i):
-            x[i] = x[i] - ell[i][k] * x[k]
-    x = [x[i] * inverse_pivot[i] for i in range(n)]
-    for i in reversed(range(n)):
-        for k in range(i + 1, n):
-            x[i] = x[i] - ell[k][i] * x[k]
-    x = jnp.stack([x[i] * scale[i] for i in range(n)])
-    most = jnp.finfo(A.dtype).max ** 0.5
-    solved = jnp.all(jnp.abs(x) <= most, axis=0, keepdims=True)  # False for NaN
-    return jnp.where(solved, x, 0.0 * b)
-
-
-def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    r"""Lower factor $L$ of a small positive definite $A = L L^T$, unrolled.
-
-    It calls no LAPACK, so a batch vectorises under `jax.vmap`. The batched LAPACK calls
-    of jaxlib 0.10 wait for the thread pool that runs them, and can wait for ever if
-    several CPU devices do so at once.
-
-    Args:
-        A: Symmetric positive definite matrix, (n, n). Only the lower triangle is read.
-    """
-    n = A.shape[-1]
-    ell = [[jnp.zeros((), A.dtype)] * n for _ in range(n)]
-    for j in range(n):
-        for i in range(j, n):
-            rest = A[i, j]
-            for k in range(j):
-                rest = rest - ell[i][k] * ell[j][k]
-            ell[i][j] = jnp.sqrt(rest) if i == j else rest / ell[j][j]
-    return jnp.stack([jnp.stack(row) for row in ell])
-
-
-def solve_lower(
-    L: Float[Array, "n n"], b: Float[Array, " n *k"], transposed: bool = False
-) -> Float[Array, " n *k"]:
-    """Solve ``L x = b``, or ``L^T x = b``, for a small lower triangular L, unrolled.
-
-    Args:
-        L: Lower triangular matrix, (n, n).
-        b: Right-hand side, (n,) or (n, k).
-        transposed: Whether to solve with the transposed matrix.
-    """
-    n = L.shape[-1]
-    x: list[Array] = list(b)
-    for i in reversed(range(n)) if transposed else range(n):
-        for k in range(i + 1, n) if transposed else range(i):
-            x[i] = x[i] - (L[k, i] if transposed else L[i, k]) * x[k]
-        x[i] = x[i] / L[i, i]
-    return jnp.stack(x)
+    return scale, ell, inverse_pivot
 
 
 LARGEST = 1e4

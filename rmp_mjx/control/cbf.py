@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from rmp_mjx.control.avoidance import obstacle_gaps, self_gaps
 from rmp_mjx.control.torque import clip_torque, torque_range
 from rmp_mjx.control.vices import VICES
-from rmp_mjx.math import cholesky, psd_solve, solve_lower
+from rmp_mjx.math import inverse_root, psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.pytree import Constant
 from rmp_mjx.robot.kinematics import ArmState
@@ -138,8 +138,8 @@ class FilteredVICES(VICES):
         G = jnp.concatenate([-barriers.rows, Mq, -Mq])
         h = jnp.concatenate([need, tau_max - bias, tau_max + bias]) - G @ wanted
         limits = jnp.ones(2 * self.robot.n, bool)
-        L = cholesky(Mq)
-        G = solve_lower(L, G.T)
+        R = inverse_root(Mq)
+        G = jnp.matmul(R, G.T, precision="highest")
         length = jnp.sqrt(jnp.sum(G * G, axis=0))
         active = jnp.concatenate([barriers.active, limits]) & (length > FREE)
         scale = jnp.where(active, 1.0 / jnp.where(active, length, 1.0), 0.0)
@@ -149,7 +149,7 @@ class FilteredVICES(VICES):
         change, solved = project(G[:, kept], h[kept], self.penalty)
         left_out = h > h[kept[-1]]
         solved *= ~jnp.any(left_out & (change @ G > h))
-        return wanted + solve_lower(L, change, transposed=True), solved
+        return wanted + jnp.matmul(R.T, change, precision="highest"), solved
 
 
 def _beyond(barriers: Barriers, margin: Array | float) -> Barriers:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rmp_mjx.math import psd_solve
+from rmp_mjx.math import inverse_root, psd_solve
 from rmp_mjx.pytree import Constant
 
 ROUNDS, HURRIED = 64, 16
@@ -184,15 +184,15 @@ class Dual(NamedTuple):
 
 def _dual(H: Float[Array, "n n"], f: Float[Array, " n"], rows: Rows) -> Dual:
     dot = functools.partial(jnp.matmul, precision="highest")
-    X = psd_solve(H, jnp.concatenate([f[:, None], rows.A.T], axis=1))
-    free, lift = X[:, 0], X[:, 1:]
-    W = dot(rows.A, lift)
-    s = jax.lax.rsqrt(jnp.maximum(jnp.diagonal(W), jnp.finfo(W.dtype).tiny))
+    R = inverse_root(H)
+    Y, y = dot(R, rows.A.T), dot(R, f)
+    s = jax.lax.rsqrt(jnp.maximum(jnp.sum(Y * Y, axis=0), jnp.finfo(Y.dtype).tiny))
+    Y = Y * s[None]
     return Dual(
-        free,
-        lift * s[None],
-        W * s[:, None] * s[None],
-        dot(rows.A, free) * s,
+        dot(R.T, y),
+        dot(R.T, Y),
+        dot(Y.T, Y),
+        dot(Y.T, y),
         rows.low * s,
         rows.high * s,
         rows.give,
@@ -205,7 +205,8 @@ def _multipliers(dual: Dual, at_end: Float[Array, " m"]) -> Float[Array, " m"]:
     end = jnp.where(at_end > 0.0, dual.high, dual.low)
     over = jnp.where(held, dual.t - jnp.where(held, end, 0.0), 0.0)
     both = held[:, None] & held[None]
-    own = jnp.where(held, dual.give, 1.0)
+    give = jnp.maximum(dual.give, jnp.finfo(over.dtype).eps)  # rows may depend
+    own = jnp.where(held, give, 1.0)
     return _eliminate(jnp.where(both, dual.W, 0.0) + jnp.diag(own), over, own)
 
 

@@ -21,7 +21,7 @@ from rmp_mjx.control import RMPVICES
 from rmp_mjx.control.avoidance import obstacle_gaps
 from rmp_mjx.control.leaves import Leaves, leaf_of
 from rmp_mjx.control.torque import stop_time
-from rmp_mjx.math import cholesky, psd_solve, solve_lower
+from rmp_mjx.math import inverse_root, psd_solve
 from rmp_mjx.obstacles import Obstacles
 from rmp_mjx.robot.dynamics import dynamics
 from rmp_mjx.robot.kinematics import ArmState, arm_state, base_point, site_state
@@ -79,10 +79,10 @@ def think(
     robot = controller.robot
     arm = arm_state(robot, q, qd)
     Mq, bias = dynamics(robot, arm)
-    L = cholesky(Mq)
+    R = inverse_root(Mq)
 
     def size(f: Array) -> Array:
-        return jnp.sqrt(jnp.sum(solve_lower(L, f[:, None]) ** 2))
+        return jnp.sqrt(jnp.sum((R @ f) ** 2))
 
     branches = controller.asked(arm, setpoint, obstacles, tau_ext)
     root = functools.reduce(operator.add, [rmp.M for rmp in branches.values()])
@@ -103,7 +103,7 @@ def think(
         J = J_point if at_point else site.J_pos
         start[name] = world[heaviest] if at_point else site.p
         pull[name] = J @ psd_solve(Mq, rmp.f)
-    relative = solve_lower(L, solve_lower(L, root).T)
+    relative = R @ root @ R.T
     return Insight(
         asked={name: size(rmp.f) for name, rmp in branches.items()},
         missed={name: size(rmp.f - rmp.M @ qdd) for name, rmp in branches.items()},

@@ -271,3 +271,27 @@ def test_limits_are_checked_when_a_robot_is_made():
         Robot.from_mjcf(GRIPPER, site="tip", velocity_limits=[1, 2])
     with pytest.raises(RobotError, match="torque_rate_limits must be positive"):
         Robot.from_mjcf(GRIPPER, site="tip", torque_rate_limits=[1, 0, 3])
+
+
+def test_the_solution_is_finite_where_rounding_takes_the_metrics_definiteness():
+    """Four heavy directions of seven, and 1e-5 of an inertia, in float32.
+
+    The force points elsewhere, too, so no digit of the free solution is right.
+    """
+    rng = np.random.default_rng(5)
+    J = rng.normal(size=(2000, 4, 7)) * 10.0 ** rng.uniform(0.0, 3.0, (2000, 4, 1))
+    Mq = np.diag([0.8, 4.9, 4.3, 0.2, 0.07, 2.0, 0.013]).astype(np.float32)
+    H = np.float32(J.swapaxes(1, 2) @ J) + 1e-5 * Mq
+    assert np.any(np.linalg.eigvalsh(H.astype(float)) < 0.0)
+    f = np.float32(rng.normal(size=(2000, 7)) * 1e5)
+    tau = np.float32([84.0, 117.0, 97.0, 26.0, 9.9, 32.0, 1.7])
+    fast = np.full(7, 100.0, np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def solve(H, f):
+        hard = Rows.hard(jnp.asarray(Mq), -tau, tau)
+        return solve_root(H, f, Rows.join([hard, Rows.soft(jnp.eye(7), -fast, fast)]))
+
+    qdd, _ = jax.device_get(solve(H, f))
+    assert np.all(np.isfinite(qdd))
