@@ -284,7 +284,7 @@ def test_the_solution_is_finite_where_rounding_takes_the_metrics_definiteness():
     H = np.float32(J.swapaxes(1, 2) @ J) + 1e-5 * Mq
     assert np.any(np.linalg.eigvalsh(H.astype(float)) < 0.0)
     f = np.float32(rng.normal(size=(2000, 7)) * 1e5)
-    tau = np.float32([84.0, 117.0, 97.0, 26.0, 9.9, 32.0, 1.7])
+    tau = np.array([84.0, 117.0, 97.0, 26.0, 9.9, 32.0, 1.7], np.float32)
     fast = np.full(7, 100.0, np.float32)
 
     @jax.jit
