@@ -14,7 +14,7 @@ from rmp_mjx.training.policy import load_policy
 from rmp_mjx.training.runs import policies
 
 ROOT = Path(__file__).resolve().parents[1]
-MOST_BYTES, MOST_FILES = 6_460_000, 600
+MOST_BYTES, MOST_FILES = 6_480_000, 600
 SHARDS = {"checkpoints", "ocdbt.process_0"}
 """Folders of an Orbax checkpoint."""
 
