@@ -155,4 +155,6 @@ def test_distances_of_points_in_any_shape_of_array():
     flat = distance_to_segment(points.reshape(8, 3), *np.eye(3)[:2])
     found = distance_to_segment(points, *np.eye(3)[:2])
     np.testing.assert_array_equal(found, flat.reshape(4, 2))
-    assert distance_to_segment(points[0, 0], *np.eye(3)[:2]) == flat[0]
+    np.testing.assert_array_equal(
+        distance_to_segment(points[0], *np.eye(3)[:2]), flat[:2]
+    )

@@ -48,6 +48,7 @@ def test_it_is_the_sum_of_what_each_point_asks_for(bent):
 def test_every_point_is_carried_by_its_link(bent):
     expected = np.eye(4)[:, np.array(bent.points.segment)]
     np.testing.assert_array_equal(point_carrier(bent), expected)
-    rows = PointRMP(Vec(0, 0, 0), *map(jnp.asarray, range(6))).rows
+    no_force = Vec.of(jnp.zeros(3), 0)
+    rows = PointRMP(no_force, *map(jnp.asarray, range(6))).rows
     found = [[float(x) for x in (row.x, row.y, row.z)] for row in jax.device_get(rows)]
     assert found == [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
