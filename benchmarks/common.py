@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -236,6 +236,14 @@ def write_json(path: Path, rows: Iterable[Row], **settings: Any) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(as_json(document, [asdict(row) for row in rows]))
+
+
+def other_rows(path: Path | None, parts: Collection[str]) -> list[Row]:
+    """The rows that a file has of other parts (PART/...); none where it is not."""
+    if path is None or not path.is_file():
+        return []
+    rows = (Row(**row) for row in json.loads(path.read_text())["rows"])
+    return [row for row in rows if row.key.split("/")[0] not in parts]
 
 
 def as_json(document: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> str:

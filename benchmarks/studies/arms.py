@@ -11,7 +11,6 @@ as ``python -m benchmarks.arms --json FILE --docs docs/results/arms.md``.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import jax
 import numpy as np
 
 import envs
-from benchmarks.common import ROOT, Row, insert, markdown, show, write_json
+from benchmarks.common import ROOT, Row, insert, markdown, other_rows, show, write_json
 from benchmarks.studies import random_policies
 from envs.arms import JACO
 from envs.safety import ENDING
@@ -160,11 +159,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--docs", type=Path)
     args = parser.parse_args(argv)
     runtime.configure(split_cpu=True)
-    known: list[Row] = []
-    if args.json and args.json.is_file():
-        known = [Row(**row) for row in json.loads(args.json.read_text())["rows"]]
+    known = other_rows(args.json, ())
     for part in args.parts:
-        known = [row for row in known if not row.key.startswith(f"{part}/")]
+        known = [row for row in known if row.key.split("/")[0] != part]
         if part == "random":
             new = under_random_policies(args.quick)
         else:

@@ -8,7 +8,6 @@ defaults. The named failures of `benchmarks.failures` are measured too. Run as
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.common import Row, insert, markdown, show, write_json
+from benchmarks.common import Row, insert, markdown, other_rows, show, write_json
 from benchmarks.png import save_figure
 from benchmarks.studies import failures
 from benchmarks.studies.random_policies import NEAR, REACHING_LIMIT
@@ -226,10 +225,8 @@ def main(argv: list[str] | None = None) -> None:
         rows += found
         print(f"{name}: {time.perf_counter() - began:.0f} s")
     show(rows, "Where safety ends")
-    if args.failure and args.json and args.json.is_file():
-        known = (Row(**row) for row in json.loads(args.json.read_text())["rows"])
-        others = (row for row in known if row.key.split("/")[0] not in args.failure)
-        rows = [*others, *rows]
+    if args.failure:
+        rows = [*other_rows(args.json, args.failure), *rows]
     if args.json:
         settings = {"seed": args.seed, "worlds": worlds, "steps": steps}
         settings["robot"] = args.robot
